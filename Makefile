@@ -1,0 +1,75 @@
+# ir_maniskill: `make help` lists the targets. Every set-up step leaves a stamp in
+# $(VENV), so that a second run starts where the first one stopped.
+
+VENV        ?= .venv
+PYTHON      ?= python3
+TORCH_INDEX ?=
+DEMO_TASK   ?= NaoTouchCubeSingle-v1
+DEMO_DIR    ?= runs/demo
+EPISODES    ?= 100
+
+BIN         := $(VENV)/bin
+IR          := $(BIN)/ir-maniskill
+PACKAGES    := $(VENV)/.stamp-packages
+VULKAN      := $(VENV)/.stamp-vulkan
+SOURCES     := ir_maniskill tasks assets tests examples scripts
+PYTEST      := $(BIN)/python -m pytest
+
+export TORCH_INDEX
+.DELETE_ON_ERROR:
+.PHONY: help setup demo test test-fast check format doctor wheel clean
+
+help:  ## list the targets
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
+
+# --- set-up -------------------------------------------------------------------
+
+setup: $(VULKAN)  ## make .venv with all packages, and software Vulkan where there is no GPU
+
+$(VENV)/.stamp-venv:
+	scripts/create_venv.sh $(VENV) $(PYTHON)
+	touch $@
+
+$(VENV)/.stamp-torch: $(VENV)/.stamp-venv
+	scripts/install_torch.sh $(VENV) constraints.txt
+	touch $@
+
+$(PACKAGES): $(VENV)/.stamp-torch pyproject.toml constraints.txt
+	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[dev]'
+	touch $@
+
+$(VULKAN): $(PACKAGES)
+	scripts/install_vulkan.sh $(VENV)
+	touch $@
+
+# --- the demonstration --------------------------------------------------------
+
+demo: $(VULKAN)  ## train NAO to touch the blue cube from images, evaluate it, make a video
+	@scripts/demo.sh $(IR) $(DEMO_TASK) $(DEMO_DIR) $(EPISODES)
+
+# --- tests --------------------------------------------------------------------
+
+test: $(VULKAN) check  ## everything CI runs: lint, types, tests, wheel
+	$(PYTEST) --durations=10
+	scripts/check_wheel.sh $(VENV)
+
+test-fast: $(VULKAN)  ## the tests that are not marked slow
+	$(PYTEST) -m "not slow" -q
+
+check: $(PACKAGES)  ## lint, format check and types
+	$(BIN)/ruff check $(wildcard $(SOURCES))
+	$(BIN)/ruff format --check $(wildcard $(SOURCES))
+	$(BIN)/mypy
+
+format: $(PACKAGES)  ## let ruff format and fix what it can
+	$(BIN)/ruff check --fix $(wildcard $(SOURCES))
+	$(BIN)/ruff format $(wildcard $(SOURCES))
+
+wheel: $(VULKAN)  ## build the wheel, install it in a clean environment, step a task
+	scripts/check_wheel.sh $(VENV)
+
+doctor: $(PACKAGES)  ## say whether this machine can render, and what to install if not
+	@$(BIN)/python -I ir_maniskill/doctor.py
+
+clean:  ## remove what make made, except runs/
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis

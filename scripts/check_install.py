@@ -1,0 +1,54 @@
+"""Checks an installed ir_maniskill: everything comes from there, and a task steps."""
+
+from __future__ import annotations
+
+import sys
+from importlib import resources
+from pathlib import Path
+
+import gymnasium as gym
+
+
+def main() -> None:
+    """Runs all checks against the environment whose folder is the first argument."""
+    prefix = Path(sys.argv[1]).resolve()
+    assert "ir_maniskill" not in sys.modules
+    env = gym.make(
+        "ir_maniskill:NaoTouchCubeSingle-v1",
+        obs_mode="rgb",
+        sensor_configs={"width": 64, "height": 128},
+    )
+    check_origin(prefix)
+    check_step(env)
+    env.close()
+    print(f"The installed wheel works: {prefix}")
+
+
+def check_origin(prefix: Path) -> None:
+    """Modules and data files lie under the prefix, none in a checkout."""
+    for name, module in sorted(sys.modules.items()):
+        if name.partition(".")[0] != "ir_maniskill" or not module.__file__:
+            continue
+        assert Path(module.__file__).resolve().is_relative_to(prefix), module
+    assert "ir_maniskill.tasks" in sys.modules, "the tasks were not imported"
+    nao = resources.files("ir_maniskill.assets") / "nao"
+    urdf = Path(str(nao / "nao.urdf"))
+    assert urdf.is_file() and urdf.resolve().is_relative_to(prefix), urdf
+    meshes = [path for path in urdf.parent.rglob("*.glb")]
+    assert meshes, f"no meshes beside {urdf}"
+
+
+def check_step(env: gym.Env) -> None:
+    """A reset and a step give images, an instruction and a reward."""
+    observation, _ = env.reset(seed=0)
+    for camera in ("top_camera", "front_camera"):
+        picture = observation["sensor_data"][camera]["rgb"]
+        assert tuple(picture.shape) == (1, 128, 64, 3), picture.shape
+        assert float(picture.float().std()) > 1, f"{camera} sees nothing"
+    _, reward, *_, info = env.step(env.action_space.sample())
+    assert reward.shape == (1,) and "success" in info
+    assert "touch the" in env.unwrapped.get_language_instruction()[0]
+
+
+if __name__ == "__main__":
+    main()
