@@ -1,0 +1,1 @@
+"""Models the environments are built from, one folder per robot."""
