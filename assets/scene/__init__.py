@@ -1,0 +1,1 @@
+"""What stands around the robot: the room with its table, and the button."""

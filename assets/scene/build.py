@@ -1,0 +1,91 @@
+"""Builds `room.glb` and `button.glb`: `python -m ir_maniskill.assets.scene.build`.
+
+The room (table, floor, wall) is one mesh with one material, hence one draw call. The
+table's measures are those of the experiments and of the scene's collision box.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from ir_maniskill.assets.nao import SOLE_HEIGHT
+from ir_maniskill.assets.nao.shapes import Surface, bake, join, knob
+
+FOLDER = Path(__file__).parent
+
+TABLE_X, TABLE_Y, TABLE_Z = (0.10, 0.40), (-0.34, 0.34), (0.01, 0.03)
+"""Extents of the table top [m]."""
+LEG_WIDTH = 0.03
+"""Edge of a table leg [m]."""
+ROOM_X, ROOM_Y, ROOM_HEIGHT = (-0.8, 1.2), (-2.4, 2.4), 1.6
+"""Extents of the floor, and height of the wall behind the robot [m]."""
+SKIRTING_HEIGHT = 0.05
+"""Height of the skirting board [m]."""
+BUTTON_PROFILE = ((-0.012, 0.020), (0.006, 0.020), (0.011, 0.016), (0.012, 0.0))
+"""(height, radius) of the button from the foot up, about its center [m]."""
+BUTTON_SEGMENTS = 12
+"""Points per ring of the button."""
+
+TOP, EDGE, LEG, FLOOR, WALL, SKIRTING = range(6)
+PALETTE = (
+    (214, 206, 194),  # TOP: warm, darker than the robot and paler than the objects
+    (158, 128, 94),  # EDGE: wood
+    (112, 116, 124),  # LEG: steel
+    (120, 126, 134),  # FLOOR
+    (88, 110, 134),  # WALL: blue grey, so that the white robot stands out
+    (62, 78, 98),  # SKIRTING
+)
+_LIGHT = (0.6, 0.15, 1.0)
+
+
+def box(*extents: tuple[float, float], color: int) -> Surface:
+    """Return a box along the axes, hard-edged.
+
+    Args:
+        *extents: (low, high) along x, y and z [m].
+        color: Index into the palette.
+    """
+    low, high = np.array(extents, float).T
+    mesh = trimesh.creation.box(high - low)
+    side = np.argmax(mesh.face_normals @ np.vstack([np.eye(3), -np.eye(3)]).T, axis=1)
+    vertices = mesh.vertices + (low + high) / 2
+    return Surface(vertices, mesh.faces, np.full(len(mesh.faces), color), side)
+
+
+def room() -> Surface:
+    """Return the table, the floor and the wall."""
+    top = box(TABLE_X, TABLE_Y, TABLE_Z, color=EDGE)
+    parts = [top.painted(TOP, lambda c: c[2] > TABLE_Z[1] - 1e-6)]
+    for x in (TABLE_X[0], TABLE_X[1] - LEG_WIDTH):
+        for y in (TABLE_Y[0], TABLE_Y[1] - LEG_WIDTH):
+            leg = ((x, x + LEG_WIDTH), (y, y + LEG_WIDTH), (SOLE_HEIGHT, TABLE_Z[0]))
+            parts.append(box(*leg, color=LEG))
+    ground = (SOLE_HEIGHT - 0.02, SOLE_HEIGHT)
+    behind = (ROOM_X[0] - 0.02, ROOM_X[0])
+    before = (ROOM_X[0], ROOM_X[0] + 0.01)
+    wall = (SOLE_HEIGHT, SOLE_HEIGHT + ROOM_HEIGHT)
+    skirting = (SOLE_HEIGHT, SOLE_HEIGHT + SKIRTING_HEIGHT)
+    parts.append(box(ROOM_X, ROOM_Y, ground, color=FLOOR))
+    parts.append(box(behind, ROOM_Y, wall, color=WALL))
+    parts.append(box(before, ROOM_Y, skirting, color=SKIRTING))
+    return join(parts)
+
+
+def button() -> trimesh.Trimesh:
+    """Return a round button that stands upright; its color is given at load."""
+    surface = knob(0, BUTTON_PROFILE, BUTTON_SEGMENTS).turned(0, -np.pi / 2, 0)
+    mesh = bake(surface, ((255, 255, 255),), _LIGHT)
+    return trimesh.Trimesh(
+        mesh.vertices, mesh.faces, vertex_normals=mesh.vertex_normals, process=False
+    )
+
+
+def main() -> None:
+    """Write the meshes beside this file."""
+    bake(room(), PALETTE, _LIGHT).export(FOLDER / "room.glb")
+    button().export(FOLDER / "button.glb")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,30 @@
+"""InstructRobot on ManiSkill: a NAO learns to touch what a sentence names.
+
+Importing this package registers the robot `nao` and every task id, and does
+nothing else.
+"""
+
+from ir_maniskill.environment.vector import make_vec
+from ir_maniskill.experiment import (
+    Experiment,
+    Instruction,
+    Jitter,
+    TouchObject,
+    available,
+    touch_instructions,
+)
+from ir_maniskill.registration import register
+
+import ir_maniskill.tasks  # noqa: E402, F401, I001 - registers the tasks
+
+__all__ = [
+    "Experiment",
+    "Instruction",
+    "Jitter",
+    "TouchObject",
+    "available",
+    "make_vec",
+    "register",
+    "touch_instructions",
+]
+__version__ = "0.1.0"

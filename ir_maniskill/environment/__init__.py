@@ -1,0 +1,1 @@
+"""The Environment block: Instructional Set, Reward Generator, Robot (Sec. III-A)."""

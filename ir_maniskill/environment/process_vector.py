@@ -1,0 +1,442 @@
+"""CPU vector env: worker processes that each step several envs.
+
+Observations, rewards and infos cross process borders in one block of shared memory;
+pipes carry only commands. Legend: N envs.
+"""
+
+from __future__ import annotations
+
+import multiprocessing as mp
+import os
+import signal
+import time
+import traceback
+from collections.abc import Iterator
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from multiprocessing.shared_memory import SharedMemory
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from torch import Tensor
+
+from ir_maniskill.experiment import Experiment
+
+Tree = dict[str, Any]
+"""Nested dicts with tensors or arrays as leaves."""
+
+
+class WorkerError(RuntimeError):
+    """A worker process failed, died or hangs; the message names it."""
+
+
+@dataclass(frozen=True)
+class _Leaf:
+    """One array in the shared block."""
+
+    path: tuple[str, ...]
+    shape: tuple[int, ...]
+    dtype: str
+    offset: int
+
+
+class _SharedTree:
+    """Named arrays [N, ...] in one block of shared memory."""
+
+    ALIGNMENT = 64
+
+    def __init__(self, leaves: list[_Leaf], memory: SharedMemory) -> None:
+        self.leaves, self._memory = leaves, memory
+        self.arrays = {
+            leaf.path: np.ndarray(
+                leaf.shape, leaf.dtype, buffer=memory.buf, offset=leaf.offset
+            )
+            for leaf in leaves
+        }
+
+    @classmethod
+    def create(cls, sample: Tree, num_envs: int) -> _SharedTree:
+        """Make room for N rows of every leaf of `sample`, whose leaves have one."""
+        leaves, offset = [], 0
+        for path, value in _walk(sample):
+            shape = (num_envs, *value.shape[1:])
+            leaves.append(_Leaf(path, shape, value.dtype.str, offset))
+            size = int(np.prod(shape)) * value.dtype.itemsize
+            offset += -(-size // cls.ALIGNMENT) * cls.ALIGNMENT
+        return cls(leaves, SharedMemory(create=True, size=max(offset, 1)))
+
+    @property
+    def address(self) -> tuple[list[_Leaf], str]:
+        """What another process needs to `attach`."""
+        return self.leaves, self._memory.name
+
+    @classmethod
+    def attach(cls, address: tuple[list[_Leaf], str]) -> _SharedTree:
+        leaves, name = address
+        return cls(leaves, SharedMemory(name=name))
+
+    def write(self, row: int, tree: Tree) -> None:
+        """Copy the one row of `tree` to `row`."""
+        for path, value in _walk(tree):
+            self.arrays[path][row] = value[0]
+
+    def read(self, *prefix: str) -> Tree:
+        """Return copies, as nested tensors, of all below `prefix`."""
+        tree: Tree = {}
+        for path, array in self.arrays.items():
+            if path[: len(prefix)] == prefix:
+                *parents, name = path[len(prefix) :]
+                node = tree
+                for parent in parents:
+                    node = node.setdefault(parent, {})
+                node[name] = torch.from_numpy(array.copy())
+        return tree
+
+    def close(self, unlink: bool) -> None:
+        self.arrays.clear()
+        self._memory.close()
+        if unlink:
+            self._memory.unlink()
+
+
+def _walk(tree: Tree, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple, np.ndarray]]:
+    """Yield (path, array) of every tensor or array leaf."""
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            yield from _walk(value, (*path, name))
+        elif isinstance(value, Tensor):
+            yield (*path, name), value.numpy()
+        elif isinstance(value, np.ndarray):
+            yield (*path, name), value
+
+
+class ProcessVectorEnv(VectorEnv):
+    """N envs on the CPU, spread evenly over worker processes.
+
+    Scripts that make one must guard their entry with `if __name__ == "__main__":`,
+    as always with processes that are not forked.
+    """
+
+    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
+    device = torch.device("cpu")
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        num_envs: int,
+        *,
+        num_workers: int | None = None,
+        env_kwargs: dict[str, Any] | None = None,
+        timeout: float = 180.0,
+    ) -> None:
+        """Start the workers and make their envs.
+
+        Args:
+            experiment: What to make; sent to the workers, so that one registered by
+                a user's script is known to them too.
+            num_envs: Number of envs N.
+            num_workers: Number of processes; None is one per core.
+            env_kwargs: Passed to `gym.make`.
+            timeout: How long a worker may take for one command [s].
+
+        Raises:
+            WorkerError: A worker could not make its envs.
+        """
+        cores = len(os.sched_getaffinity(0))
+        workers = min(num_envs, num_workers or cores)
+        self.experiment, self.num_envs, self._timeout = experiment, num_envs, timeout
+        self._rows = [list(r) for r in np.array_split(np.arange(num_envs), workers)]
+        self._shared: _SharedTree | None = None
+        self._pipes: list[Connection] = []
+        self._processes: list[mp.process.BaseProcess] = []
+        context = mp.get_context("forkserver")
+        context.set_forkserver_preload(["ir_maniskill"])
+        for index, rows in enumerate(self._rows):
+            ours, theirs = context.Pipe()
+            process = context.Process(
+                target=_work,
+                args=(theirs, experiment, [int(r) for r in rows], env_kwargs or {}),
+                name=f"ir-maniskill-worker-{index}",
+                daemon=True,
+            )
+            process.start()
+            theirs.close()
+            self._pipes.append(ours)
+            self._processes.append(process)
+        try:
+            self._connect()
+        except BaseException:
+            self.close_extras()
+            raise
+
+    def _connect(self) -> None:
+        """Learn the spaces from the workers and lay out the shared memory."""
+        samples = self._gather()
+        sample, self.single_observation_space, self.single_action_space = samples[0]
+        self.observation_space = batch_space(
+            self.single_observation_space, self.num_envs
+        )
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._shared = _SharedTree.create(sample, self.num_envs)
+        self._command("attach", [self._shared.address] * len(self._pipes))
+
+    # -- VectorEnv -------------------------------------------------------------------
+
+    def reset(
+        self,
+        *,
+        seed: int | list[int] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Tree, Tree]:
+        """Start a new episode in every env.
+
+        Args:
+            seed: Env i gets seed + i, or the i-th of a list; None goes on with each
+                env's own random stream.
+            options: Passed to the envs; a tensor of N values is dealt out, one each.
+        """
+        if isinstance(seed, int):
+            seed = list(range(seed, seed + self.num_envs))
+        seeds = seed if seed is not None else [None] * self.num_envs
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"seeds: got {len(seeds)}, expected {self.num_envs}")
+        each = [_options_of(options, row) for row in range(self.num_envs)]
+        self._command(
+            "reset", [[(seeds[r], each[r]) for r in rows] for rows in self._rows]
+        )
+        return self._shared.read("obs"), self._shared.read("info")
+
+    def step(self, actions: Tensor | np.ndarray) -> tuple[Tree, Tensor, ...]:
+        """Step every env and reset those that are done.
+
+        Args:
+            actions: One row per env [N, J] in [-1, 1].
+
+        Returns:
+            Observation, reward [N], terminated [N], truncated [N] and info.
+        """
+        self.step_async(actions)
+        return self.step_wait()
+
+    def step_async(self, actions: Tensor | np.ndarray) -> None:
+        """Send the actions and return at once; `step_wait` must follow."""
+        actions = np.asarray(actions, dtype=np.float32)
+        expected = (self.num_envs, *self.single_action_space.shape)
+        if actions.shape != expected:
+            raise ValueError(f"actions: got shape {actions.shape}, expected {expected}")
+        self._shared.arrays["action",][:] = actions
+        self._send("step", [None] * len(self._pipes))
+
+    def step_wait(self) -> tuple[Tree, Tensor, ...]:
+        """Wait for all workers and return what `step` returns."""
+        self._gather()
+        shared = self._shared
+        now = shared.read("now")
+        info = shared.read("info")
+        done = now["terminated"] | now["truncated"]
+        if done.any():
+            info["final_observation"] = shared.read("final", "obs")
+            info["final_info"] = shared.read("final", "info")
+            info["_final_observation"] = info["_final_info"] = done
+        obs = shared.read("obs")
+        return obs, now["reward"], now["terminated"], now["truncated"], info
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """End all workers; none is left behind, whatever state it is in."""
+        for pipe in self._pipes:
+            try:
+                pipe.send(("close", None))
+            except OSError:
+                pass
+            pipe.close()
+        deadline = time.monotonic() + 5.0
+        for process in self._processes:
+            process.join(max(0.0, deadline - time.monotonic()))
+            if process.is_alive():
+                process.kill()
+                process.join()
+        self._pipes, self._processes = [], []
+        if self._shared is not None:
+            self._shared.close(unlink=True)
+            self._shared = None
+
+    # -- Random streams --------------------------------------------------------------
+
+    def get_rng_state(self) -> list:
+        """Return each env's random stream as it was before the env's last reset.
+
+        `set_rng_state` followed by an unseeded `reset` starts the same episodes anew.
+        """
+        parts = self._command("get_rng", [None] * len(self._pipes))
+        return [state for part in parts for state in part]
+
+    def set_rng_state(self, states: list) -> None:
+        """Restore what `get_rng_state` returned."""
+        if len(states) != self.num_envs:
+            raise ValueError(
+                f"random streams: got {len(states)}, expected {self.num_envs}"
+            )
+        self._command("set_rng", [[states[r] for r in rows] for rows in self._rows])
+
+    # -- Talking to the workers ------------------------------------------------------
+
+    def _command(self, name: str, arguments: list) -> list:
+        self._send(name, arguments)
+        return self._gather()
+
+    def _send(self, name: str, arguments: list) -> None:
+        for index, (pipe, argument) in enumerate(
+            zip(self._pipes, arguments, strict=True)
+        ):
+            try:
+                pipe.send((name, argument))
+            except OSError:
+                raise self._died(index) from None
+
+    def _gather(self) -> list:
+        """Collect one answer from every worker."""
+        answers: list = [None] * len(self._pipes)
+        pending = {pipe: index for index, pipe in enumerate(self._pipes)}
+        deadline = time.monotonic() + self._timeout
+        while pending:
+            ready = wait(list(pending), max(0.0, deadline - time.monotonic()))
+            if not ready:
+                names = ", ".join(self._describe(i) for i in pending.values())
+                raise WorkerError(
+                    f"no answer within {self._timeout:.0f} s from {names}"
+                )
+            for pipe in ready:
+                index = pending.pop(pipe)
+                try:
+                    ok, answers[index] = pipe.recv()
+                except (EOFError, OSError):
+                    raise self._died(index) from None
+                if not ok:
+                    raise WorkerError(
+                        f"{self._describe(index)} failed:\n{answers[index]}"
+                    )
+        return answers
+
+    def _describe(self, index: int) -> str:
+        rows = self._rows[index]
+        return f"{self._processes[index].name} (envs {rows[0]} to {rows[-1]})"
+
+    def _died(self, index: int) -> WorkerError:
+        process = self._processes[index]
+        process.join(1.0)
+        return WorkerError(
+            f"{self._describe(index)} died with exit code {process.exitcode}; "
+            "a negative one is the signal that killed it (-9: often out of memory)"
+        )
+
+
+def _options_of(options: dict[str, Any] | None, row: int) -> dict[str, Any] | None:
+    if options is None:
+        return None
+    return {
+        name: int(value[row]) if isinstance(value, Tensor) and value.ndim else value
+        for name, value in options.items()
+    }
+
+
+class _Worker:
+    """The envs of one process."""
+
+    def __init__(
+        self, experiment: Experiment, rows: list[int], env_kwargs: dict[str, Any]
+    ) -> None:
+        from ir_maniskill.registration import register
+
+        register(experiment)
+        self._rows = rows
+        self._envs = [gym.make(experiment.id, **env_kwargs) for _ in rows]
+        self._rng: list = [None] * len(rows)
+        self._shared: _SharedTree | None = None
+
+    def describe(self) -> tuple[Tree, gym.Space, gym.Space]:
+        """Return a one-row sample of all that is shared, and the spaces."""
+        env = self._envs[0]
+        obs, info = env.reset(seed=0)
+        action = env.action_space.sample()[None]
+        sample = _record(obs, info)
+        one = {"terminated": np.zeros(1, bool), "truncated": np.zeros(1, bool)}
+        sample["now"] = {"reward": np.zeros(1, np.float32), **one}
+        sample["final"] = _record(obs, info)
+        sample["action"] = action
+        space = env.unwrapped.single_observation_space
+        return sample, space, env.unwrapped.single_action_space
+
+    def attach(self, address: tuple) -> None:
+        """Open the shared memory."""
+        self._shared = _SharedTree.attach(address)
+
+    def reset(self, arguments: list[tuple]) -> None:
+        """Reset every env with its seed and options."""
+        for index, (seed, options) in enumerate(arguments):
+            self._reset(index, seed, options)
+
+    def _reset(self, index: int, seed: int | None, options: dict | None) -> None:
+        env = self._envs[index]
+        if seed is not None:
+            self._rng[index] = np.random.RandomState(seed).get_state(legacy=False)
+        else:
+            self._rng[index] = _stream(env).get_state(legacy=False)
+        self._shared.write(
+            self._rows[index], _record(*env.reset(seed=seed, options=options))
+        )
+
+    def step(self, _: None) -> None:
+        """Step every env, and reset it if its episode is over."""
+        actions = self._shared.arrays["action",]
+        for index, (row, env) in enumerate(zip(self._rows, self._envs, strict=True)):
+            obs, reward, terminated, truncated, info = env.step(actions[row])
+            now = {"reward": reward, "terminated": terminated, "truncated": truncated}
+            record = _record(obs, info)
+            self._shared.write(row, {"now": now})
+            if terminated or truncated:
+                self._shared.write(row, {"final": record})
+                self._reset(index, None, None)
+            else:
+                self._shared.write(row, record)
+
+    def get_rng(self, _: None) -> list:
+        """Return the random streams as they were before the last resets."""
+        return self._rng
+
+    def set_rng(self, states: list) -> None:
+        """Set the random streams."""
+        for env, state in zip(self._envs, states, strict=True):
+            _stream(env).set_state(state)
+
+
+def _record(obs: Tree, info: Tree) -> Tree:
+    """Return what is shared of an observation and info: the cameras do not move."""
+    return {"obs": {k: v for k, v in obs.items() if k != "sensor_param"}, "info": info}
+
+
+def _stream(env: gym.Env) -> np.random.RandomState:
+    return env.unwrapped._batched_episode_rng.rngs[0]
+
+
+def _work(
+    pipe: Connection, experiment: Experiment, rows: list[int], env_kwargs: dict
+) -> None:
+    """Run a worker: answer commands until told to close or the parent is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    torch.set_num_threads(1)
+    try:
+        worker = _Worker(experiment, rows, env_kwargs)
+        pipe.send((True, worker.describe()))
+        while True:
+            name, argument = pipe.recv()
+            if name == "close":
+                return
+            pipe.send((True, getattr(worker, name)(argument)))
+    except (EOFError, BrokenPipeError):
+        return
+    except Exception:
+        pipe.send((False, traceback.format_exc()))

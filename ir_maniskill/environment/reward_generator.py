@@ -1,0 +1,91 @@
+"""Reward Generator: pure tensor functions from contacts to reward (Sec. III-A, IV).
+
+Nothing here knows the simulator. Legend: N envs, F fingers, C objects.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ir_maniskill.experiment import Experiment
+
+
+@dataclass(frozen=True)
+class FingerCount:
+    """How many fingers touch what."""
+
+    right: Tensor
+    """Fingers on the named object [N] int64."""
+    wrong: Tensor
+    """Fingers on any other object [N] int64."""
+
+
+def count_fingers(contact: Tensor, target: Tensor) -> FingerCount:
+    """Count the fingers on the named object and on the others.
+
+    A finger that touches both counts in both.
+
+    Args:
+        contact: Whether finger f touches object c [N, F, C] bool.
+        target: Index of the named object [N] int64.
+    """
+    index = target[:, None, None].expand(-1, contact.shape[1], 1)  # [N, F, 1]
+    on_target = contact.gather(2, index)[..., 0]  # [N, F]
+    others = contact.scatter(2, index, False)  # [N, F, C]
+    return FingerCount(on_target.sum(1), others.any(2).sum(1))
+
+
+def sparse_reward(experiment: Experiment, count: FingerCount) -> Tensor:
+    """Return the paper's reward of the experiment [N] float32.
+
+    "binary" (experiments I, II): 1 while any finger is on the named object.
+    "per_finger" (experiment III): 1 for each such finger. Both take
+    `wrong_penalty` for each finger on another object (0.1 in experiment III).
+    """
+    right = count.right
+    if experiment.reward == "binary":
+        right = right.clamp(max=1)
+    return right.float() - experiment.wrong_penalty * count.wrong
+
+
+@dataclass(frozen=True)
+class DenseWeights:
+    """Weights of the dense reward, which is ours and not the paper's."""
+
+    reach: float = 0.5
+    """Reward of bringing a hand to the named object, at most."""
+    reach_scale: float = 0.1
+    """Distance at which `reach` has fallen to a quarter, about [m]."""
+    wrong: float = 0.5
+    """Taken while another object is touched by any finger."""
+
+
+def dense_reward(
+    experiment: Experiment,
+    count: FingerCount,
+    distance: Tensor,
+    weights: DenseWeights,
+) -> Tensor:
+    """Return the sparse reward plus shaping toward the named object [N] float32.
+
+    Args:
+        experiment: Whose reward to shape.
+        count: Fingers on the named and on other objects.
+        distance: From each finger to the named object's center [N, F] [m].
+        weights: How much each term counts.
+    """
+    nearest = distance.min(dim=1).values  # [N]
+    reach = weights.reach * (1 - torch.tanh(nearest / weights.reach_scale))
+    wrong = weights.wrong * count.wrong.clamp(max=1)
+    return sparse_reward(experiment, count) + reach - wrong
+
+
+def highest_reward(
+    experiment: Experiment, fingers: int, weights: DenseWeights
+) -> float:
+    """Return the largest dense reward that one step can give."""
+    touch = 1.0 if experiment.reward == "binary" else float(fingers)
+    return touch + weights.reach

@@ -1,0 +1,331 @@
+"""TouchEnv: ManiSkill's hooks and the wiring of the Environment block (Sec. III-A).
+
+Legend: N envs, b envs being reset, J joints, F fingers, C objects, L tokens.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.sensors.camera import CameraConfig
+from mani_skill.utils.structs import Pose
+from mani_skill.utils.structs.types import SceneConfig, SimConfig
+from torch import Tensor
+
+from ir_maniskill import experiment as catalog
+from ir_maniskill.environment import reward_generator, table_scene
+from ir_maniskill.environment.contacts import contact_query
+from ir_maniskill.environment.instructional_set import InstructionalSet
+from ir_maniskill.environment.reward_generator import DenseWeights, FingerCount
+from ir_maniskill.environment.robot.nao import Nao
+from ir_maniskill.experiment import Experiment
+
+TOUCH_FORCE = 0.01
+"""Force from which a contact counts as a touch [N]."""
+
+TASK_STATE = ("instruction_index", "success_once", "wrong_once")
+"""What of the task belongs to the env state, beside bodies and joint targets."""
+
+
+class TouchEnv(BaseEnv):
+    """A robot behind a table is told by a sentence which object to touch.
+
+    **Task Description:**
+    Each episode has one sentence, such as "Touch the blue cube.". The robot is
+    rewarded for fingers on the object that it names (paper, Sec. IV).
+
+    **Randomizations:**
+    - the sentence, drawn from the experiment's Instructional Set
+    - the objects' places and yaws and the joints' start, by `Experiment.jitter`
+    - which object lies where, if `Experiment.shuffled`
+
+    **Success Conditions:**
+    - a finger touches the named object. This does not end the episode, since holding
+      the touch is what is rewarded; the time limit does.
+    """
+
+    SUPPORTED_ROBOTS = ["nao"]
+    SUPPORTED_REWARD_MODES = ("sparse", "dense", "normalized_dense", "none")
+    agent: Nao
+
+    def __init__(
+        self,
+        *args: Any,
+        experiment: str | Experiment,
+        robot_uids: str = "nao",
+        render_backend: str | None = "auto",
+        dense_weights: dict[str, float] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        """Build the env.
+
+        Args:
+            experiment: The experiment or its id.
+            robot_uids: Which robot; only "nao" is supported.
+            render_backend: As for `BaseEnv`; "auto" is a CUDA device where there is
+                one and else whatever Vulkan finds, software included.
+            dense_weights: Changes of `DenseWeights`, used by the dense reward modes.
+            *args: As for `BaseEnv`.
+            **kwargs: As for `BaseEnv`.
+
+        Raises:
+            UnknownExperimentError: There is no experiment of that id.
+        """
+        if isinstance(experiment, str):
+            experiment = catalog.get(experiment)
+        self.experiment = experiment
+        self.dense_weights = replace(DenseWeights(), **(dense_weights or {}))
+        if render_backend == "auto":
+            render_backend = "gpu" if torch.cuda.is_available() else "cpu"
+        super().__init__(
+            *args, robot_uids=robot_uids, render_backend=render_backend, **kwargs
+        )
+
+    # -- Scene -----------------------------------------------------------------------
+
+    @property
+    def _default_sim_config(self) -> SimConfig:
+        return SimConfig(
+            sim_freq=200,
+            control_freq=20,
+            scene_config=SceneConfig(contact_offset=0.005),
+        )
+
+    @property
+    def _default_sensor_configs(self) -> list[CameraConfig]:
+        return table_scene.policy_cameras()
+
+    @property
+    def _default_human_render_camera_configs(self) -> CameraConfig:
+        return table_scene.video_camera()
+
+    def _load_agent(self, options: dict) -> None:
+        super()._load_agent(options, sapien.Pose())
+
+    def _load_scene(self, options: dict) -> None:
+        table_scene.build_room(self.scene)
+        self.objects = [
+            table_scene.build_object(self.scene, thing)
+            for thing in self.experiment.objects
+        ]
+
+    def _load_lighting(self, options: dict) -> None:
+        table_scene.add_lights(self.scene, shadow=self.enable_shadow)
+
+    def _setup_sensors(self, options: dict) -> None:
+        # Picture formats are global: a video camera made earlier leaves floats behind.
+        sapien.render.set_picture_format("Color", "r8g8b8a8unorm")
+        super()._setup_sensors(options)
+        self._sensor_params = None
+
+    def _after_reconfigure(self, options: dict) -> None:
+        self.instructional_set = InstructionalSet(self.experiment, self.device)
+        self._contact_force = contact_query(
+            self.scene, self.agent.finger_links, self.objects
+        )
+        things = self.experiment.objects
+        heights = [table_scene.OBJECT_HEIGHT[thing.shape] for thing in things]
+        self._places = np.array([thing.position for thing in things])  # [C, 2] [m]
+        self._object_z = table_scene.TABLE_TOP + np.array(heights) / 2  # [C] [m]
+        self.instruction_index = self._zeros(torch.int64)
+        self._success_once = self._zeros(torch.bool)
+        self._wrong_once = self._zeros(torch.bool)
+
+    def _zeros(self, dtype: torch.dtype) -> Tensor:
+        return torch.zeros(self.num_envs, dtype=dtype, device=self.device)
+
+    # -- Episode ---------------------------------------------------------------------
+
+    def _initialize_episode(self, env_idx: Tensor, options: dict) -> None:
+        count, joints = len(self.objects), len(self.agent.start_qpos)
+        noise = self._batched_episode_rng[env_idx].uniform(size=1 + 4 * count + joints)
+        pick, order, place, yaw, joint = np.split(
+            noise, np.cumsum([1, count, 2 * count, count]), axis=1
+        )
+        self._choose_instruction(env_idx, pick[:, 0], options.get("instruction"))
+        self._place_objects(order, 2 * place - 1, 2 * yaw - 1)
+        jitter = self._tensor(2 * joint - 1) * self.experiment.jitter.joints
+        qpos = self.agent.clamp_qpos(self.agent.start_qpos + jitter)
+        self.agent.robot.set_qpos(qpos)
+        self._success_once[env_idx] = False
+        self._wrong_once[env_idx] = False
+
+    def _choose_instruction(
+        self, env_idx: Tensor, uniform: np.ndarray, forced: int | Tensor | None
+    ) -> None:
+        index = self.instructional_set.pick(self._tensor(uniform))
+        if forced is not None:
+            index = torch.as_tensor(forced, device=self.device).expand(len(env_idx))
+            if not ((index >= 0) & (index < len(self.instructional_set))).all():
+                raise ValueError(
+                    f"reset option 'instruction': got {forced}, expected indices 0 to "
+                    f"{len(self.instructional_set) - 1}: {self.experiment.sentences}"
+                )
+        self.instruction_index[env_idx] = index
+
+    def _place_objects(
+        self, order: np.ndarray, place: np.ndarray, yaw: np.ndarray
+    ) -> None:
+        """Lay the objects out; all arguments are uniform noise with b rows."""
+        batch, count = order.shape
+        seat = np.argsort(order) if self.experiment.shuffled else np.arange(count)
+        jitter = self.experiment.jitter
+        xy = np.broadcast_to(self._places[seat], (batch, count, 2))
+        xy = xy + jitter.position * place.reshape(batch, count, 2)
+        z = np.broadcast_to(self._object_z, (batch, count))
+        position = self._tensor(np.concatenate([xy, z[..., None]], axis=-1))
+        rotation = self._tensor(table_scene.yaw_quaternion(jitter.yaw * yaw))
+        for index, thing in enumerate(self.objects):
+            thing.set_pose(Pose.create_from_pq(position[:, index], rotation[:, index]))
+
+    def _tensor(self, array: np.ndarray) -> Tensor:
+        return torch.as_tensor(array, dtype=torch.float32, device=self.device)
+
+    def step(self, action: Any) -> tuple[Any, Tensor, Tensor, Tensor, dict]:
+        """Step as ManiSkill does, except that success does not end the episode."""
+        obs, reward, terminated, truncated, info = super().step(action)
+        return obs, reward, torch.zeros_like(terminated), truncated, info
+
+    # -- What the sentence asks ------------------------------------------------------
+
+    @property
+    def target_index(self) -> Tensor:
+        """Index in `objects` of the one that the active sentence names [N] int64."""
+        return self.instructional_set.targets[self.instruction_index]
+
+    def get_language_instruction(self) -> list[str]:
+        """Return the active sentence i_t of each env (N strings)."""
+        sentences = self.experiment.sentences
+        return [sentences[index] for index in self.instruction_index.tolist()]
+
+    # -- Measures --------------------------------------------------------------------
+
+    def evaluate(self) -> dict[str, Tensor]:
+        """Measure contacts and what they mean for the active sentence.
+
+        Returns:
+            Per env [N]: `right_fingers` and `wrong_fingers` (int64), `success` (the
+            named object is touched now), `success_once` and `wrong_once` (so far in
+            this episode), `exclusive_success` (the named object has been touched and
+            no other) as bool; and `contact` [N, F, C] bool.
+        """
+        # Right after a reset PhysX still holds the contacts of the last episode.
+        started = (self._elapsed_steps > 0)[:, None, None]
+        contact = (self._contact_force() > TOUCH_FORCE) & started
+        count = reward_generator.count_fingers(contact, self.target_index)
+        success = count.right > 0
+        self._success_once = self._success_once | success
+        self._wrong_once = self._wrong_once | (count.wrong > 0)
+        return {
+            "contact": contact,
+            "right_fingers": count.right,
+            "wrong_fingers": count.wrong,
+            "success": success,
+            "success_once": self._success_once,
+            "wrong_once": self._wrong_once,
+            "exclusive_success": self._success_once & ~self._wrong_once,
+        }
+
+    # -- Observation o_t -------------------------------------------------------------
+
+    def _get_obs_agent(self) -> dict[str, Tensor]:
+        obs = self.agent.get_proprioception()
+        if self.obs_mode_struct.use_state:
+            obs["velocity"] = self.agent.joint_velocity()
+        return obs
+
+    def _get_obs_extra(self, info: dict[str, Tensor]) -> dict[str, Tensor]:
+        obs = {
+            "touch": info["contact"].any(dim=2).float(),  # [N, F]
+            "instruction": self.instructional_set.tokens[self.instruction_index],
+        }
+        if self.obs_mode_struct.use_state:
+            one_hot = torch.nn.functional.one_hot(self.target_index, len(self.objects))
+            obs["object_position"] = self._object_position()  # [N, C, 3]
+            obs["finger_position"] = self.agent.finger_position()  # [N, F, 3]
+            obs["target_object"] = one_hot.float()  # [N, C]
+        return obs
+
+    def _object_position(self) -> Tensor:
+        return torch.stack([thing.pose.p for thing in self.objects], dim=1)
+
+    def get_sensor_params(self) -> dict:
+        """Return the cameras' matrices, computed once: no camera ever moves."""
+        if self._sensor_params is None:
+            self._sensor_params = super().get_sensor_params()
+        return self._sensor_params
+
+    # -- Reward r_t ------------------------------------------------------------------
+
+    def compute_sparse_reward(
+        self, obs: Any, action: Tensor, info: dict[str, Tensor]
+    ) -> Tensor:
+        """Return the paper's reward of this experiment [N]."""
+        return reward_generator.sparse_reward(self.experiment, _count(info))
+
+    def compute_dense_reward(
+        self, obs: Any, action: Tensor, info: dict[str, Tensor]
+    ) -> Tensor:
+        """Return the paper's reward with our shaping toward the named object [N]."""
+        rows = torch.arange(self.num_envs, device=self.device)
+        goal = self._object_position()[rows, self.target_index]  # [N, 3]
+        distance = (self.agent.finger_position() - goal[:, None]).norm(dim=-1)
+        return reward_generator.dense_reward(
+            self.experiment, _count(info), distance, self.dense_weights
+        )
+
+    def compute_normalized_dense_reward(
+        self, obs: Any, action: Tensor, info: dict[str, Tensor]
+    ) -> Tensor:
+        """Return the dense reward divided by the most that a step can give [N]."""
+        highest = reward_generator.highest_reward(
+            self.experiment, len(self.agent.fingers), self.dense_weights
+        )
+        return self.compute_dense_reward(obs, action, info) / highest
+
+    # -- State -----------------------------------------------------------------------
+
+    def get_state_dict(self) -> dict:
+        """Return bodies, joint targets and the task's own state."""
+        state = super().get_state_dict()
+        task = (self.instruction_index, self._success_once, self._wrong_once)
+        state["task"] = {
+            name: value.float()[:, None]
+            for name, value in zip(TASK_STATE, task, strict=True)
+        }
+        return state
+
+    def set_state_dict(self, state: dict, env_idx: Tensor | None = None) -> None:
+        """Restore what `get_state_dict` returned, for all envs or for `env_idx`."""
+        super().set_state_dict(state, env_idx)
+        rows = slice(None) if env_idx is None else env_idx
+        if "controller" in state:
+            target = self.agent.controller.target.clone()
+            target[rows] = state["controller"]["target_qpos"].to(target)
+            self.agent.controller.set_state({"target_qpos": target})
+        if "task" in state:
+            task = {name: state["task"][name][..., 0] for name in TASK_STATE}
+            self.instruction_index[rows] = task["instruction_index"].long()
+            self._success_once[rows] = task["success_once"].bool()
+            self._wrong_once[rows] = task["wrong_once"].bool()
+
+    def set_state(self, state: Tensor, env_idx: Tensor | None = None) -> None:
+        """Restore what `get_state` returned: the same, as one flat row per env."""
+        tail = len(self.agent.start_qpos) + len(TASK_STATE)
+        super().set_state(state[:, :-tail], env_idx)
+        target, task = state[:, -tail:].split(
+            [tail - len(TASK_STATE), len(TASK_STATE)], 1
+        )
+        columns = dict(zip(TASK_STATE, task.split(1, dim=1), strict=True))
+        self.set_state_dict(
+            {"controller": {"target_qpos": target}, "task": columns}, env_idx
+        )
+
+
+def _count(info: dict[str, Tensor]) -> FingerCount:
+    return FingerCount(info["right_fingers"], info["wrong_fingers"])

@@ -1,0 +1,93 @@
+"""Vectorized envs: one factory for GPU-batched and CPU multi-process envs.
+
+Both give torch tensors with the same keys, shapes, dtypes and the same end of an
+episode: an env that is done is reset in the same step, and `info` holds
+`final_observation`, `final_info` and the masks `_final_observation`, `_final_info`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import torch
+from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
+from numpy.random import RandomState
+
+from ir_maniskill import experiment as catalog
+from ir_maniskill.environment.process_vector import ProcessVectorEnv
+
+
+def make_vec(
+    task_id: str,
+    num_envs: int,
+    *,
+    num_workers: int | None = None,
+    sim_backend: str = "auto",
+    **env_kwargs: Any,
+) -> GpuVectorEnv | ProcessVectorEnv:
+    """Make `num_envs` envs that step together.
+
+    Args:
+        task_id: A registered task id.
+        num_envs: Number of envs N.
+        num_workers: Worker processes on the CPU; None is one per core.
+        sim_backend: "physx_cuda" (one process, batched), "physx_cpu" (processes), or
+            "auto": CUDA where torch sees a device, else processes.
+        **env_kwargs: As for `gym.make(task_id)`.
+
+    Raises:
+        UnknownExperimentError: There is no task of that id.
+        ValueError: A number is out of range.
+        WorkerError: A worker process failed to start its envs.
+    """
+    experiment = catalog.get(task_id)
+    if num_envs < 1:
+        raise ValueError(f"num_envs: got {num_envs}, expected at least 1")
+    if sim_backend == "auto":
+        sim_backend = "physx_cuda" if torch.cuda.is_available() else "physx_cpu"
+    if sim_backend.startswith("physx_cuda"):
+        return GpuVectorEnv(task_id, num_envs, sim_backend=sim_backend, **env_kwargs)
+    return ProcessVectorEnv(
+        experiment, num_envs, num_workers=num_workers, env_kwargs=env_kwargs
+    )
+
+
+class GpuVectorEnv(ManiSkillVectorEnv):
+    """ManiSkill's GPU-batched vector env with our seeding: env i gets seed + i.
+
+    Not yet run on a GPU.
+    """
+
+    def __init__(self, task_id: str, num_envs: int, **env_kwargs: Any) -> None:
+        """Make the batched env; the arguments are those of `make_vec`."""
+        env = gym.make(task_id, num_envs=num_envs, **env_kwargs)
+        super().__init__(env, ignore_terminations=True)
+        self.experiment = self.base_env.experiment
+        self._rng: list = [None] * num_envs
+
+    def reset(
+        self, *, seed: int | list[int] | None = None, options: dict | None = None
+    ) -> tuple[dict, dict]:
+        """Reset all envs, or those of `options["env_idx"]`."""
+        if isinstance(seed, int):
+            seed = list(range(seed, seed + self.num_envs))
+        rows = range(self.num_envs)
+        if options and "env_idx" in options:
+            rows = options["env_idx"].tolist()
+        for index, row in enumerate(rows):
+            stream = self._stream(row) if seed is None else RandomState(seed[index])
+            self._rng[row] = stream.get_state(legacy=False)
+        return super().reset(seed=seed, options=options)
+
+    def get_rng_state(self) -> list:
+        """Return each env's random stream as it was before the env's last reset."""
+        return list(self._rng)
+
+    def set_rng_state(self, states: list) -> None:
+        """Restore what `get_rng_state` returned; an unseeded `reset` must follow."""
+        for row, state in enumerate(states):
+            self._stream(row).set_state(state)
+
+    def _stream(self, row: int) -> RandomState:
+        return self.base_env._batched_episode_rng.rngs[row]

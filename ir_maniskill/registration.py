@@ -1,0 +1,30 @@
+"""Makes an `Experiment` known to `gym.make`."""
+
+from __future__ import annotations
+
+from mani_skill.utils.registration import REGISTERED_ENVS, register_env
+
+from ir_maniskill import experiment as catalog
+from ir_maniskill.environment.touch_env import TouchEnv
+from ir_maniskill.experiment import Experiment
+
+
+def register(experiment: Experiment) -> Experiment:
+    """Register an experiment as a task: afterwards `gym.make(experiment.id)` works.
+
+    Registering the same experiment again does nothing.
+
+    Returns:
+        The experiment itself, so that a task file reads `TASK = register(...)`.
+
+    Raises:
+        ExperimentError: Another experiment has that id already.
+    """
+    catalog.add(experiment)
+    if experiment.id not in REGISTERED_ENVS:
+        register_env(
+            experiment.id,
+            max_episode_steps=experiment.episode_steps,
+            experiment=experiment.id,
+        )(TouchEnv)
+    return experiment

@@ -1,0 +1,22 @@
+"""Experiment III: a triangle, proprioception, a reward per finger (paper, Sec. IV-C)."""
+
+from ir_maniskill.experiment import Experiment, touch_instructions
+from ir_maniskill.registration import register
+from ir_maniskill.tasks import layouts
+
+
+def triangle(task_id: str, shape: str) -> Experiment:
+    """Return the improved multi-instruction experiment with objects of that shape."""
+    objects = layouts.triangle(shape)
+    return Experiment(
+        id=task_id,
+        objects=objects,
+        instructions=touch_instructions(objects),
+        reward="per_finger",
+        wrong_penalty=0.1,
+        senses=("vision", "proprioception", "touch"),
+    )
+
+
+CUBE = register(triangle("NaoTouchCubeTriangle-v1", "cube"))
+BUTTON = register(triangle("NaoTouchButtonTriangle-v1", "button"))
