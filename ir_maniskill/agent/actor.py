@@ -1,0 +1,57 @@
+"""Actor: from B_t to the action a_t."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.distributions import Normal
+
+
+def tanh_layers(
+    inputs: int, hidden: Sequence[int], outputs: int, gain: float
+) -> nn.Sequential:
+    """Return linear layers with tanh between them; `gain` scales the last one."""
+    widths = (inputs, *hidden, outputs)
+    gains = (*(math.sqrt(2) for _ in hidden), gain)
+    layers: list[nn.Module] = []
+    for into, out, scale in zip(widths, widths[1:], gains, strict=False):
+        linear = nn.Linear(into, out)
+        nn.init.orthogonal_(linear.weight, scale)
+        nn.init.zeros_(linear.bias)
+        layers += [linear, nn.Tanh()]
+    return nn.Sequential(*layers[:-1])
+
+
+class Actor(nn.Module):
+    """pi(a|s): a Gaussian whose mean is read from B_t, whose deviation is not."""
+
+    log_std: Tensor
+
+    def __init__(
+        self,
+        inputs: int,
+        hidden: Sequence[int],
+        actions: int,
+        *,
+        std: float,
+        learn_std: bool,
+    ) -> None:
+        """Make the layers; at first every mean is near 0, the middle of each joint."""
+        super().__init__()
+        self.mean = tanh_layers(inputs, hidden, actions, gain=0.01)
+        log_std = torch.full((actions,), math.log(std))
+        if learn_std:
+            self.log_std = nn.Parameter(log_std)
+        else:
+            self.register_buffer("log_std", log_std)
+
+    def forward(self, aligned: Tensor) -> Normal:
+        """Return the distribution of a_t [N,A] given B_t [N,D]."""
+        mean = self.mean(aligned)
+        std = self.log_std.exp().expand_as(mean)
+        return Normal(mean, std, validate_args=False)
+
+    def set_std(self, std: float) -> None:
+        """Set the deviation of every action (a schedule's, not a learned one)."""
+        self.log_std.data.fill_(math.log(std))

@@ -1,0 +1,1 @@
+"""Training: roll-outs, PPO, checkpoints and the loop around them."""

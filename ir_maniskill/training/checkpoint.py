@@ -1,0 +1,256 @@
+"""Checkpoints: everything a run needs to go on, in one file without pickles.
+
+Both kinds of file are safetensors with a JSON header: a *checkpoint* is complete
+(weights, optimizer, normalizers, random states), a *policy* holds only the weights that
+act. Either opens with `load_policy`.
+"""
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import os
+import random
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load as parse_tensors
+from safetensors.torch import save as format_tensors
+from torch import Tensor
+
+from ir_maniskill.agent.agent import Agent, StateSpec
+from ir_maniskill.training.config import ConfigError, TrainConfig, decode
+
+CHECKPOINT = "ir_maniskill checkpoint 1"
+POLICY = "ir_maniskill policy 1"
+
+TRAINING_ONLY = ("critic.", "critic_encoder.", "locator.")
+"""Weights that a policy file leaves out."""
+
+
+class CheckpointError(RuntimeError):
+    """A file that cannot be used, or written: what was got, what is expected."""
+
+
+@dataclass(frozen=True)
+class Stored:
+    """Contents of a checkpoint or policy file."""
+
+    kind: str
+    """`CHECKPOINT` or `POLICY`."""
+    tensors: dict[str, Tensor]
+    """Tensors by name."""
+    metadata: dict[str, Any]
+    """Plain data: config, spec, steps, figures, and in checkpoints random states."""
+
+
+def write(path: Path, stored: Stored) -> None:
+    """Write the file so that a crash leaves either the old one or the new one.
+
+    Raises:
+        CheckpointError: if it cannot be written; the file there before is untouched.
+    """
+    tensors = {k: v.detach().cpu().contiguous() for k, v in stored.tensors.items()}
+    text = json.dumps(stored.metadata)
+    header = {"kind": stored.kind, "metadata": text, "digest": _digest(tensors, text)}
+    data = format_tensors(tensors, header)
+    aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with aside.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        aside.replace(path)
+        _sync_folder(path.parent)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            aside.unlink(missing_ok=True)
+        raise CheckpointError(
+            f"cannot write {path}: {error.strerror}; free some space or choose another "
+            "folder (what was saved before is intact)"
+        ) from error
+
+
+def read(path: Path) -> Stored:
+    """Return the contents of a checkpoint or policy file.
+
+    Raises:
+        CheckpointError: if the file is missing, foreign, cut short or altered.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise CheckpointError(f"cannot read {path}: {error.strerror}") from error
+    try:
+        header = _header(data)
+        if header.get("kind") not in (CHECKPOINT, POLICY):
+            raise ValueError(f"its kind is {header.get('kind')!r}")
+        tensors = parse_tensors(data)
+        if _digest(tensors, header["metadata"]) != header["digest"]:
+            raise ValueError("its contents do not match their checksum")
+        return Stored(header["kind"], tensors, json.loads(header["metadata"]))
+    except (
+        SafetensorError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        OverflowError,
+        RuntimeError,
+        RecursionError,
+        MemoryError,
+    ) as error:
+        raise CheckpointError(
+            f"{path}: got a file that is cut short, altered or not ours ({error}); "
+            f"expected {CHECKPOINT!r} or {POLICY!r}: restore it, or train anew"
+        ) from error
+
+
+def _header(data: bytes) -> dict[str, str]:
+    """Return the metadata of a safetensors file: 8 bytes of length, then JSON."""
+    length = int.from_bytes(data[:8], "little")
+    if not 2 <= length <= len(data) - 8:
+        raise ValueError(f"{len(data)} bytes, with a header of {length}")
+    return json.loads(data[8 : 8 + length])["__metadata__"]
+
+
+def _digest(tensors: Mapping[str, Tensor], text: str) -> str:
+    digest = hashlib.sha256(text.encode())
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        digest.update(tensor.reshape(-1).view(torch.uint8).numpy())
+    return digest.hexdigest()
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make the renaming itself durable (a no-op where folders cannot be synced)."""
+    with contextlib.suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def describe(agent: Agent, config: TrainConfig, **facts: object) -> dict[str, Any]:
+    """Return the metadata that every file carries."""
+    resolved = dataclasses.replace(config, agent=agent.config)
+    return {
+        "config": dataclasses.asdict(resolved),
+        "spec": dataclasses.asdict(agent.spec),
+        "env_id": config.env_id,
+        "seed": config.seed,
+        **facts,
+    }
+
+
+def save_policy(
+    path: Path,
+    agent: Agent,
+    config: TrainConfig,
+    *,
+    steps: int,
+    evaluation: Mapping[str, Any],
+    half: bool = False,
+) -> None:
+    """Write the weights that act, with where they come from and how good they are.
+
+    Args:
+        path: file to write.
+        agent: the learner.
+        config: how it was trained.
+        steps: environment steps it was trained for.
+        evaluation: figures of its evaluation, plain data.
+        half: store 16 instead of 32 bits a weight.
+    """
+    weights = {
+        name: weight.half() if half and weight.is_floating_point() else weight
+        for name, weight in agent.state_dict().items()
+        if not name.startswith(TRAINING_ONLY)
+    }
+    facts = describe(agent, config, steps=steps, evaluation=dict(evaluation))
+    write(path, Stored(POLICY, weights, facts))
+
+
+def load_policy(path: Path | str) -> tuple[Agent, TrainConfig, dict[str, Any]]:
+    """Return the agent of a policy or checkpoint file, its config and its metadata.
+
+    The agent of a policy file has no critic: use `agent.policy`.
+
+    Raises:
+        CheckpointError: if the file is none of ours, or does not fit its own config.
+    """
+    stored = read(Path(path))
+    complete = stored.kind == CHECKPOINT
+    try:
+        config = decode(TrainConfig, stored.metadata["config"])
+        spec = StateSpec(**stored.metadata["spec"])
+        agent = Agent(config.agent, spec, policy_only=not complete)
+        agent.load_state_dict(
+            _under("agent", stored.tensors) if complete else stored.tensors
+        )
+    except (ConfigError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise CheckpointError(
+            f"{path}: its weights and its config do not belong together ({error}); "
+            "expected a file written by this version of ir_maniskill"
+        ) from error
+    agent.eval()
+    return agent, config, stored.metadata
+
+
+def _under(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors named `prefix.` something, without that prefix."""
+    start = prefix + "."
+    return {k.removeprefix(start): v for k, v in tensors.items() if k.startswith(start)}
+
+
+def random_state() -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Return the state of every random generator this process uses."""
+    tensors = {"random.torch": torch.get_rng_state()}
+    if torch.cuda.is_available():
+        tensors["random.cuda"] = torch.cuda.get_rng_state()
+    name, keys, *rest = np.random.get_state()
+    tensors["random.numpy"] = torch.from_numpy(np.asarray(keys).astype(np.int64))
+    version, state, gauss = random.getstate()
+    return tensors, {"numpy": [name, *rest], "python": [version, list(state), gauss]}
+
+
+def set_random_state(tensors: Mapping[str, Tensor], plain: Mapping[str, Any]) -> None:
+    """Put every random generator back to what `random_state` returned."""
+    torch.set_rng_state(tensors["random.torch"])
+    if torch.cuda.is_available() and "random.cuda" in tensors:
+        torch.cuda.set_rng_state(tensors["random.cuda"])
+    name, *rest = plain["numpy"]
+    keys = tensors["random.numpy"].numpy().astype(np.uint32)
+    np.random.set_state((name, keys, *rest))
+    version, state, gauss = plain["python"]
+    random.setstate((version, tuple(state), gauss))
+
+
+def pack(agent: Agent, optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """Return copies of the weights and of the optimizer's averages, by name."""
+    tensors = {f"agent.{k}": v for k, v in agent.state_dict().items()}
+    for index, averages in optimizer.state_dict()["state"].items():
+        tensors |= {f"optimizer.{index}.{k}": v for k, v in averages.items()}
+    return {name: tensor.detach().clone() for name, tensor in tensors.items()}
+
+
+def unpack(
+    tensors: Mapping[str, Tensor], agent: Agent, optimizer: torch.optim.Optimizer
+) -> None:
+    """Load what `pack` returned into an agent and its optimizer."""
+    agent.load_state_dict(_under("agent", tensors))
+    averages: dict[int, dict[str, Tensor]] = {}
+    for name, tensor in _under("optimizer", tensors).items():
+        index, key = name.split(".", 1)
+        averages.setdefault(int(index), {})[key] = tensor
+    state = optimizer.state_dict()
+    optimizer.load_state_dict(
+        {"state": averages, "param_groups": state["param_groups"]}
+    )

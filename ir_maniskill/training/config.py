@@ -1,0 +1,336 @@
+"""Every number of a training run, as frozen dataclasses that survive JSON.
+
+`CONFIGS["paper"]` holds what the paper and its reference code say, `CONFIGS["default"]`
+our tuned values; both run the same code.
+"""
+
+import dataclasses
+import json
+import types
+import typing
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeVar
+
+Sense = Literal["vision", "proprioception", "touch", "state"]
+
+Config = TypeVar("Config")
+
+
+class ConfigError(ValueError):
+    """A configuration value that cannot be used: what was got, what is expected."""
+
+
+def _require(condition: bool, name: str, got: object, expected: str) -> None:
+    if not condition:
+        raise ConfigError(f"{name}: got {got!r}, expected {expected}")
+
+
+def _require_choice(name: str, got: str, annotation: Any) -> None:
+    choices = typing.get_args(annotation)
+    _require(got in choices, name, got, "one of " + ", ".join(map(repr, choices)))
+
+
+@dataclass(frozen=True)
+class AgentConfig:
+    """Shape of the learner: which boxes it has, and how wide they are."""
+
+    senses: tuple[Sense, ...] | None = ("vision", "proprioception", "touch")
+    """What the actor perceives beside the sentence; None: the experiment's own senses.
+    "state" is the simulator's own state, for finding out what can be learned."""
+    sees_target: bool = True
+    """Whether proprioception includes the joint targets (needed by delta actions)."""
+    vocabulary: int = 10
+    """Number of token ids, <pad> = 0 included."""
+    language_layers: int = 3
+    """Transformer encoder layers."""
+    language_heads: int = 2
+    """Attention heads a layer."""
+    language_width: int = 50
+    """Units of each token's representation."""
+    vision: Literal["strided", "paper"] = "strided"
+    """"paper": two 5x5 convolutions over the cameras side by side; "strided": three
+    stride-2 convolutions for each camera."""
+    vision_channels: tuple[int, ...] = (16, 32, 32)
+    """Channels of the strided convolutions; each halves height and width."""
+    film: bool = True
+    """Whether the sentence modulates the strided convolutions (FiLM)."""
+    vision_width: int = 256
+    """Units of V_t."""
+    body_width: int = 128
+    """Units of H_t."""
+    hidden: tuple[int, ...] = (500, 256, 128)
+    """Units of the actor's and the critic's tanh layers."""
+    critic: Literal["asymmetric", "separate", "shared"] = "asymmetric"
+    """What the critic reads: the simulator's state instead of images, its own encoder
+    of the actor's senses, or the actor's B_t."""
+    std_mode: Literal["annealed", "fixed", "learned"] = "annealed"
+    """How the standard deviation of the action noise evolves."""
+    std: float = 0.5
+    """Standard deviation of the action noise at the start."""
+    std_final: float = 0.2
+    """Standard deviation at the end, if annealed."""
+    auxiliary_weight: float = 0.0
+    """Weight of the loss that predicts where the named object is; 0: no such head."""
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot work."""
+        for sense in self.senses or ():
+            _require_choice("senses", sense, Sense)
+        _require(self.senses != (), "senses", self.senses, "at least one, or None")
+        _require_choice("vision", self.vision, Literal["strided", "paper"])
+        modes = Literal["asymmetric", "separate", "shared"]
+        _require_choice("critic", self.critic, modes)
+        modes = Literal["annealed", "fixed", "learned"]
+        _require_choice("std_mode", self.std_mode, modes)
+        for name in ("vocabulary", "language_layers", "language_heads"):
+            _require(getattr(self, name) > 0, name, getattr(self, name), "at least 1")
+        width, heads = self.language_width, self.language_heads
+        fits = width > 0 and width % heads == 0
+        _require(fits, "language_width", width, f"a multiple of {heads} heads")
+        for name in ("vision_channels", "hidden"):
+            units = getattr(self, name)
+            fits = bool(units) and min(units) > 0
+            _require(fits, name, units, "one or more positive sizes")
+        _require(self.std > 0, "std", self.std, "more than 0")
+        _require(self.std_final > 0, "std_final", self.std_final, "more than 0")
+        weight = self.auxiliary_weight
+        _require(weight >= 0, "auxiliary_weight", weight, "0 or more")
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """Proximal policy optimization."""
+
+    rollouts: int = 64
+    """Roll-outs collected for each update."""
+    rollout_length: int = 32
+    """Steps of each roll-out (an episode of 32 steps of 50 ms)."""
+    epochs: int = 8
+    """Passes over the collected steps, at most."""
+    minibatch: int | None = 256
+    """Steps of each gradient; None: all of them."""
+    learning_rate: float = 3e-4
+    """Adam's step size."""
+    gamma: float = 0.95
+    """Discount of a step."""
+    gae_lambda: float = 0.95
+    """Decay of generalized advantage estimation; 1: Monte-Carlo returns."""
+    bootstrap: bool = True
+    """Whether the value of the last observation stands for what the time limit cut."""
+    clip: float = 0.2
+    """Largest change of an action's probability ratio that is rewarded."""
+    value_weight: float = 0.5
+    """Weight of the critic's loss."""
+    entropy_weight: float = 0.0
+    """Weight of the entropy bonus (only a learned std feels it)."""
+    max_kl: float | None = 0.05
+    """No further epoch once the policy moved this far [nat]; None: all epochs."""
+    max_grad_norm: float | None = 0.5
+    """Longest gradient; None: any."""
+    normalize_reward: bool = True
+    """Whether rewards are divided by the running deviation of the returns."""
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot work."""
+        for name in ("rollouts", "rollout_length", "epochs"):
+            _require(getattr(self, name) > 0, name, getattr(self, name), "at least 1")
+        batch, total = self.minibatch, self.rollouts * self.rollout_length
+        fits = batch is None or 2 <= batch <= total
+        _require(fits, "minibatch", batch, f"2 to {total} steps, or None")
+        for name in ("gamma", "gae_lambda"):
+            value = getattr(self, name)
+            _require(0 <= value <= 1, name, value, "0 to 1")
+        for name in ("learning_rate", "clip"):
+            _require(getattr(self, name) > 0, name, getattr(self, name), "more than 0")
+        for name in ("value_weight", "entropy_weight"):
+            _require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more")
+        for name in ("max_kl", "max_grad_norm"):
+            value = getattr(self, name)
+            _require(value is None or value > 0, name, value, "more than 0, or None")
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """One training run: the task, the learner, the budget, and where it is kept."""
+
+    env_id: str = "NaoTouchCubeSingle-v1"
+    """Task to learn."""
+    out: str = "runs/default"
+    """Folder of the run: checkpoints, metrics, TensorBoard events."""
+    seed: int = 0
+    """Seed of weights, exploration and scenes."""
+    total_steps: int = 60_000
+    """Environment steps, over all envs; rounded up to whole updates."""
+    num_envs: int = 16
+    """Scenes simulated side by side; must divide `ppo.rollouts`."""
+    num_workers: int | None = None
+    """Simulator processes on the CPU; None: one a core."""
+    threads: int | None = None
+    """Threads of the update; None: one a core."""
+    control_mode: str = "pd_joint_target_delta_pos"
+    """What an action means: "pd_joint_target_delta_pos" moves the joint targets,
+    "pd_joint_pos" sets them (the paper's)."""
+    reward_mode: str = "sparse"
+    """Reward of the task: "sparse" is the paper's."""
+    shader_pack: str | None = None
+    """Shader pack of the cameras; None: the task's own."""
+    camera_height: int = 64
+    """Height of each image [pixel]."""
+    camera_width: int = 32
+    """Width of each image [pixel]."""
+    frames: int = 3
+    """Observations stacked into a state."""
+    eval_interval: int = 20_000
+    """Steps from one evaluation to the next."""
+    eval_episodes: int = 30
+    """Episodes of each evaluation, spread evenly over the instructions."""
+    eval_seed: int = 1_000_000
+    """Seed of the evaluation's scenes, apart from those of training."""
+    checkpoint_interval: int = 20_000
+    """Steps from one complete checkpoint to the next."""
+    stop_at_success: float | None = None
+    """Stop early once an evaluation's success, of the worst instruction, is this high;
+    None: use up all steps."""
+    agent: AgentConfig = field(default_factory=AgentConfig)
+    """The learner."""
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    """How it learns."""
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot work."""
+        positive = ("total_steps", "num_envs", "camera_height", "camera_width")
+        positive += ("frames", "eval_interval", "eval_episodes", "checkpoint_interval")
+        for name in positive:
+            _require(getattr(self, name) > 0, name, getattr(self, name), "at least 1")
+        for name in ("num_workers", "threads"):
+            value = getattr(self, name)
+            _require(value is None or value > 0, name, value, "at least 1, or None")
+        for name in ("seed", "eval_seed"):
+            value = getattr(self, name)
+            _require(0 <= value < 2**31, name, value, "0 to 2**31 - 1")
+        rollouts = self.ppo.rollouts
+        fits = rollouts % self.num_envs == 0
+        _require(fits, "num_envs", self.num_envs, f"a divisor of {rollouts} rollouts")
+        goal = self.stop_at_success
+        _require(goal is None or 0 < goal <= 1, "stop_at_success", goal, "0 to 1")
+
+    @property
+    def steps_per_env(self) -> int:
+        """T, the steps each env makes for one update."""
+        return self.ppo.rollouts * self.ppo.rollout_length // self.num_envs
+
+    @property
+    def steps_per_update(self) -> int:
+        """T x N, the steps all envs make for one update."""
+        return self.ppo.rollouts * self.ppo.rollout_length
+
+    @property
+    def needs_state(self) -> bool:
+        """Whether training reads the simulator's state, beside what the actor sees."""
+        agent = self.agent
+        return agent.critic == "asymmetric" or agent.auxiliary_weight > 0
+
+    def env_kwargs(self, *, training: bool) -> dict[str, Any]:
+        """Keyword arguments for `gym.make`, for training or for using the policy."""
+        senses = self.agent.senses
+        sees = senses is None or "vision" in senses
+        state = (training and self.needs_state) or "state" in (senses or ())
+        modes = {(True, True): "rgb+state_dict", (True, False): "rgb"}
+        cameras: dict[str, Any] = {
+            "width": self.camera_width,
+            "height": self.camera_height,
+        }
+        if self.shader_pack is not None:
+            cameras["shader_pack"] = self.shader_pack
+        return {
+            "obs_mode": modes.get((sees, state), "state_dict"),
+            "control_mode": self.control_mode,
+            "reward_mode": self.reward_mode,
+            "sensor_configs": cameras,
+        }
+
+
+CONFIGS: dict[str, TrainConfig] = {
+    "default": TrainConfig(),
+    "paper": TrainConfig(
+        out="runs/paper",
+        total_steps=150_000,
+        num_envs=24,
+        control_mode="pd_joint_pos",
+        camera_height=128,
+        camera_width=64,
+        agent=AgentConfig(
+            senses=None,
+            sees_target=False,
+            vision="paper",
+            film=False,
+            critic="separate",
+            std_mode="fixed",
+            std=0.36,
+        ),
+        ppo=PPOConfig(
+            rollouts=24,
+            epochs=60,
+            minibatch=None,
+            learning_rate=1e-5,
+            gamma=0.99,
+            gae_lambda=1.0,
+            bootstrap=False,
+            clip=0.25,
+            max_kl=None,
+            max_grad_norm=None,
+        ),
+    ),
+}
+"""The named configurations: "paper" as published, "default" as tuned."""
+
+
+def to_json(config: object) -> str:
+    """Return the JSON text of a configuration dataclass."""
+    return json.dumps(dataclasses.asdict(config), indent=2)  # type: ignore[call-overload]
+
+
+def from_json(text: str) -> TrainConfig:
+    """Return the configuration written by `to_json`, every field checked.
+
+    Raises:
+        ConfigError: if the text is no JSON, or a field is unknown, missing, of another
+            type than declared, or out of its range.
+    """
+    try:
+        data = json.loads(text)
+    except ValueError as error:
+        raise ConfigError(f"configuration: not JSON ({error})") from error
+    return decode(TrainConfig, data)
+
+
+def decode(cls: type[Config], data: object) -> Config:
+    """Return the dataclass `cls` from plain JSON data, strictly."""
+    _require(isinstance(data, dict), cls.__name__, data, "an object of its fields")
+    values = typing.cast("dict[str, object]", data)
+    hints = typing.get_type_hints(cls)
+    unknown, missing = sorted(values.keys() - hints), sorted(hints.keys() - values)
+    expected = f"exactly its fields (missing: {missing}, unknown: {unknown})"
+    _require(not unknown and not missing, cls.__name__, sorted(values), expected)
+    return cls(**{name: _decode(hints[name], values[name], name) for name in hints})
+
+
+def _decode(hint: Any, value: Any, name: str) -> Any:
+    """Return the JSON value as the annotated type, or raise ConfigError."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if dataclasses.is_dataclass(hint):
+        return decode(typing.cast("type", hint), value)
+    if origin in (types.UnionType, typing.Union):
+        if value is None and type(None) in arguments:
+            return None
+        return _decode(arguments[0], value, name)
+    if origin is tuple:
+        _require(isinstance(value, list | tuple), name, value, "a list")
+        return tuple(_decode(arguments[0], item, name) for item in value)
+    if origin is Literal:
+        _require(value in arguments, name, value, f"one of {arguments}")
+        return value
+    if hint is float and type(value) is int:
+        return float(value)
+    _require(type(value) is hint, name, value, f"a value of type {hint.__name__}")
+    return value

@@ -1,0 +1,291 @@
+"""Roll-outs: what the agent lived through, kept for one update."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from gymnasium.vector import VectorEnv
+from torch import Tensor
+
+from ir_maniskill.agent.agent import Act, Agent, State
+from ir_maniskill.training.config import PPOConfig
+from ir_maniskill.training.finite import check_finite
+
+
+@dataclass
+class Batch:
+    """Steps drawn from the roll-outs, B of them."""
+
+    state: State
+    """s_t, each entry [B,...]."""
+    action: Tensor
+    """a_t as sampled, not clipped [B,A]."""
+    log_prob: Tensor
+    """log pi(a_t|s_t) when it was sampled [B]."""
+    advantage: Tensor
+    """A_t [B]."""
+    returns: Tensor
+    """What the critic should have said [B]."""
+
+
+class Frames:
+    """The images of T steps of N envs, each stored once.
+
+    A state stacks S images, so storing states would hold every image S times. Kept
+    instead are the images of each step, and for each state the rows of its S images.
+    """
+
+    def __init__(self, steps: int, images: Tensor) -> None:
+        """Make room for `steps` stacks like these images [N,S,K,H,W,3]."""
+        num_envs, self.depth, *image = images.shape
+        rows = steps + self.depth - 1
+        self.images = images.new_zeros(rows, num_envs, *image)
+        self.rows = images.new_zeros(steps, num_envs, self.depth, dtype=torch.long)
+        self.births = self.rows.new_zeros(num_envs)  # row where each episode began
+
+    def begin(self, images: Tensor) -> None:
+        """Keep the images before the first step: the history of its state."""
+        self.images[: self.depth] = images.transpose(0, 1).flip(0)  # oldest first
+        self.births.zero_()
+
+    def add(self, t: int, images: Tensor, fresh: Tensor) -> None:
+        """Keep the newest images of step t; `fresh` [N]: its episode begins there."""
+        newest = t + self.depth - 1
+        self.images[newest] = images[:, 0]
+        self.births[fresh] = newest
+        rows = newest - torch.arange(self.depth, device=self.rows.device)
+        # A state never looks back beyond the first observation of its episode.
+        self.rows[t] = torch.maximum(rows, self.births[:, None])  # [N,S]
+
+    def batch(self, index: Tensor) -> Tensor:
+        """Return the stacks [B,S,K,H,W,3] of the flat indices t * N + n [B]."""
+        num_envs = len(self.births)
+        rows = self.rows.flatten(0, 1)[index]  # [B,S]
+        rows = rows * num_envs + (index % num_envs)[:, None]
+        images = self.images.flatten(0, 1).index_select(0, rows.flatten())
+        return images.unflatten(0, rows.shape)
+
+
+class Rollout:
+    """T steps of N envs."""
+
+    def __init__(self, steps: int, state: State, actions: int) -> None:
+        """Make room for `steps` states like this one."""
+        self.steps, self.num_envs = steps, len(state["instruction"])
+        plain = {k: v for k, v in state.items() if k != "images"}
+        self.state = {
+            key: value.new_zeros(steps, *value.shape) for key, value in plain.items()
+        }
+        self.frames = Frames(steps, state["images"]) if "images" in state else None
+        reward = state["touch"].new_zeros(steps, self.num_envs)
+        self.action = reward.new_zeros(*reward.shape, actions)
+        self.log_prob, self.value = reward.clone(), reward.clone()
+        self.reward, self.next_value = reward.clone(), reward.clone()
+        self.advantage, self.returns = reward.clone(), reward.clone()
+        self.done = torch.zeros_like(reward, dtype=torch.bool)
+
+    def begin(self, state: State) -> None:
+        """Prepare for the steps that follow this state."""
+        self.done[-1] = False
+        if self.frames is not None:
+            self.frames.begin(state["images"])
+
+    def add(self, t: int, state: State, act: Act) -> None:
+        """Keep the state of step t, and what the agent did."""
+        for key, kept in self.state.items():
+            kept[t] = state[key]
+        self.action[t], self.log_prob[t], self.value[t] = act
+        if self.frames is not None:
+            self.frames.add(t, state["images"], self.done[t - 1])
+
+    def add_outcome(self, t: int, reward: Tensor, done: Tensor, cut: Tensor) -> None:
+        """Keep what step t led to.
+
+        Args:
+            t: the step.
+            reward: r_t [N].
+            done: whether the episode ended with this step [N].
+            cut: value of what an ended episode would still have brought [N].
+        """
+        self.reward[t], self.done[t], self.next_value[t] = reward, done, cut
+
+    def finish(self, last_value: Tensor, gamma: float, gae_lambda: float) -> None:
+        """Turn rewards and values into advantages and returns.
+
+        Args:
+            last_value: value of the states after the last step [N].
+            gamma: discount.
+            gae_lambda: decay of the advantage estimate.
+        """
+        following = torch.cat([self.value[1:], last_value[None]])
+        self.next_value = torch.where(self.done, self.next_value, following)
+        self.advantage = advantages(
+            self.reward, self.value, self.next_value, self.done, gamma, gae_lambda
+        )
+        self.returns = self.advantage + self.value
+
+    def batch(self, index: Tensor) -> Batch:
+        """Return the steps whose flat indices t * N + n are given [B]."""
+        state = {key: kept.flatten(0, 1)[index] for key, kept in self.state.items()}
+        if self.frames is not None:
+            state["images"] = self.frames.batch(index)
+        steps = (self.action, self.log_prob, self.advantage, self.returns)
+        return Batch(state, *(kept.flatten(0, 1)[index] for kept in steps))
+
+
+def advantages(
+    reward: Tensor,
+    value: Tensor,
+    next_value: Tensor,
+    done: Tensor,
+    gamma: float,
+    gae_lambda: float,
+) -> Tensor:
+    """Return the generalized advantage estimate of every step, all [T,N].
+
+    A_t = d_t + gamma lambda A_{t+1}, with d_t = r_t + gamma V(s_{t+1}) - V(s_t); where
+    an episode is done the sum ends. With lambda = 1 these are Monte-Carlo returns less
+    the value.
+    """
+    delta = reward + gamma * next_value - value
+    carry = gamma * gae_lambda * (~done).float()
+    result, following = torch.zeros_like(reward), torch.zeros_like(reward[0])
+    for t in reversed(range(len(reward))):
+        result[t] = following = delta[t] + carry[t] * following
+    return result
+
+
+class RewardScale:
+    """Divides rewards by the running standard deviation of the discounted return.
+
+    Only the scale changes: a reward of 0 stays 0, a penalty stays negative.
+    """
+
+    def __init__(self, num_envs: int, gamma: float) -> None:
+        """Start without any experience."""
+        self.gamma = gamma
+        self.running = torch.zeros(num_envs)  # [N] discounted return so far
+        self.count, self.mean, self.variance = 0, 0.0, 1.0
+
+    def __call__(self, reward: Tensor, done: Tensor) -> Tensor:
+        """Return the rewards [T,N] scaled, after taking them into account."""
+        running = self.running.to(reward.device)
+        returns = torch.empty_like(reward)
+        for t in range(len(reward)):
+            returns[t] = running = self.gamma * running + reward[t]
+            running = running * ~done[t]
+        self.running = running
+        self._update(returns.double().flatten())
+        return reward / (self.variance**0.5 + 1e-8)
+
+    def restart(self) -> None:
+        """Forget the running returns: every env starts a new episode."""
+        self.running = torch.zeros_like(self.running)
+
+    def state_dict(self) -> dict[str, float]:
+        """Return what has to survive a restart of the program."""
+        return {"count": self.count, "mean": self.mean, "variance": self.variance}
+
+    def load_state_dict(self, state: dict[str, float]) -> None:
+        """Go on from what `state_dict` returned."""
+        self.count = int(state["count"])
+        self.mean, self.variance = float(state["mean"]), float(state["variance"])
+
+    def _update(self, returns: Tensor) -> None:
+        count, total = len(returns), self.count + len(returns)
+        shift = float(returns.mean()) - self.mean
+        spread = self.count * self.variance + float(returns.var(correction=0)) * count
+        spread += shift**2 * self.count * count / total
+        # A task without any reward so far has no scale: leave its zeros alone.
+        self.variance = spread / total if spread > 0 else 1.0
+        self.mean += shift * count / total
+        self.count = total
+
+
+@dataclass
+class EpisodeSums:
+    """Counts over the collected steps, for the log."""
+
+    steps: int = 0
+    """Steps, over all envs."""
+    episodes: int = 0
+    """Episodes that ended."""
+    reward: float = 0.0
+    """Sum of the rewards."""
+    success: int = 0
+    """Episodes in which the named object was touched."""
+    exclusive: int = 0
+    """Episodes in which it was, and never another."""
+    touching: int = 0
+    """Steps in which the named object was touched."""
+    wrong: int = 0
+    """Steps in which another object was touched."""
+
+    def add(self, reward: Tensor, done: Tensor, info: dict[str, Any]) -> None:
+        """Count one step of all envs."""
+        self.steps += len(done)
+        self.episodes += int(done.sum())
+        self.reward += float(reward.sum())
+        self.success += int(info["success_once"][done].sum())
+        self.exclusive += int(info["exclusive_success"][done].sum())
+        self.touching += int((info["right_fingers"] > 0).sum())
+        self.wrong += int((info["wrong_fingers"] > 0).sum())
+
+    def means(self) -> dict[str, float]:
+        """Return the figures per step and per episode."""
+        episodes = max(self.episodes, 1)
+        return {
+            "return": self.reward / episodes,
+            "reward": self.reward / self.steps,
+            "success": self.success / episodes,
+            "exclusive": self.exclusive / episodes,
+            "touching": self.touching / self.steps,
+            "wrong": self.wrong / self.steps,
+        }
+
+
+def to(state: State, device: torch.device) -> State:
+    """Return the state on the learner's device."""
+    return {key: value.to(device) for key, value in state.items()}
+
+
+@torch.inference_mode()
+def collect(
+    envs: VectorEnv,
+    stack: Any,
+    state: State,
+    agent: Agent,
+    rollout: Rollout,
+    config: PPOConfig,
+) -> tuple[State, EpisodeSums]:
+    """Fill the roll-out with T steps of all envs.
+
+    Returns:
+        The state to go on from, and the sums for the log.
+    """
+    device = state["instruction"].device
+    sums = EpisodeSums()
+    rollout.begin(state)
+    for t in range(rollout.steps):
+        check_finite(state, "observation", "the simulation became unstable")
+        act = agent.act(state)
+        rollout.add(t, state, act)
+        action = act.action.clamp(-1, 1).to(envs.device)
+        obs, reward, terminated, truncated, info = envs.step(action)
+        done, cut = terminated | truncated, torch.zeros_like(act.value)
+        if config.bootstrap and truncated.any():
+            final = to(stack.peek(info["final_observation"]), device)
+            cut = values_of(agent, final, truncated & ~terminated)
+        rollout.add_outcome(t, reward, done, cut)
+        sums.add(reward, done, info.get("final_info", info))
+        state = to(stack.push(obs, done), device)
+    return state, sums
+
+
+def values_of(agent: Agent, state: State, chosen: Tensor) -> Tensor:
+    """Return the value of the chosen states [N], and 0 for the others."""
+    chosen = chosen.to(state["instruction"].device)
+    values = torch.zeros(len(chosen), device=chosen.device)
+    if chosen.any():
+        values[chosen] = agent.value({k: v[chosen] for k, v in state.items()})
+    return values

@@ -1,0 +1,309 @@
+"""The training loop: collect, improve, evaluate, keep."""
+
+import dataclasses
+import json
+import logging
+import math
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from gymnasium.vector import VectorEnv
+from tqdm import tqdm
+
+from ir_maniskill.agent.agent import Agent, State, StateSpec
+from ir_maniskill.environment.state import StateStack
+from ir_maniskill.environment.vector import make_vec
+from ir_maniskill.training import checkpoint, ppo
+from ir_maniskill.training.checkpoint import CheckpointError, Stored
+from ir_maniskill.training.config import TrainConfig, decode
+from ir_maniskill.training.evaluate import EvaluationReport, evaluate_policy
+from ir_maniskill.training.rollout import RewardScale, Rollout, collect, to
+from ir_maniskill.training.run_folder import RunFolder
+
+log = logging.getLogger(__name__)
+
+MAY_CHANGE = {
+    *("out", "total_steps", "num_workers", "threads", "stop_at_success"),
+    *("eval_interval", "eval_episodes", "checkpoint_interval"),
+}
+"""Fields of the config that a resumed run may set anew."""
+
+FINAL_EPISODES = 100
+"""Episodes of the last evaluation, of the policy that is kept."""
+
+
+def train(config: TrainConfig, resume: bool = False, envs: VectorEnv = None) -> Path:
+    """Train an agent and return the file of its best policy.
+
+    Ctrl-C keeps a checkpoint of the last complete update and leaves.
+
+    Args:
+        config: task, learner, budget and folder.
+        resume: go on from the folder's last checkpoint, if there is one.
+        envs: vector of envs to use (and leave open) instead of making one.
+
+    Raises:
+        CheckpointError: if the folder or its checkpoint cannot be used.
+        TrainingDivergedError: if a number stopped being finite.
+    """
+    folder = RunFolder(Path(config.out), resume=resume)
+    ours = _make_envs(config) if envs is None else None
+    try:
+        trainer = Trainer(config, ours or envs, folder)
+        if resume and folder.last.exists():
+            trainer.restore()
+        trainer.learn()
+    finally:
+        folder.close()
+        if ours is not None:
+            ours.close()
+    return folder.best
+
+
+def _make_envs(config: TrainConfig) -> VectorEnv:
+    return make_vec(
+        config.env_id,
+        config.num_envs,
+        num_workers=config.num_workers,
+        **config.env_kwargs(training=True),
+    )
+
+
+class Trainer:
+    """One run: the agent, its optimizer, its envs, and how far it has come.
+
+    Scenes are reseeded from (seed, steps) at the start and after every checkpoint, so
+    that a run resumed there meets the same scenes as one that was never interrupted.
+    """
+
+    def __init__(self, config: TrainConfig, envs: VectorEnv, folder: RunFolder) -> None:
+        """Make an untrained agent for these envs."""
+        if config.agent.senses is None:
+            senses = tuple(envs.experiment.senses)
+            agent = dataclasses.replace(config.agent, senses=senses)
+            config = dataclasses.replace(config, agent=agent)
+        self.config, self.envs, self.folder = config, envs, folder
+        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        self.stack = StateStack(config.frames)
+        torch.manual_seed(config.seed)
+        self.steps, self.best_score = 0, -math.inf
+        self.reward_scale = RewardScale(config.num_envs, config.ppo.gamma)
+        self.state = self._fresh_scenes()
+        actions = envs.single_action_space.shape[0]
+        spec = StateSpec.of(self.state, actions)
+        self.agent = Agent(config.agent, spec).to(self.device)
+        rate = config.ppo.learning_rate
+        self.optimizer = torch.optim.Adam(self.agent.parameters(), rate, eps=1e-5)
+        self.rollout = Rollout(config.steps_per_env, self.state, actions)
+
+    def learn(self) -> None:
+        """Train until the steps are used up or the goal is reached."""
+        size = self.config.steps_per_update
+        total = math.ceil(self.config.total_steps / size) * size
+        self.folder.begin(self.config, self.steps)
+        snapshot = self.snapshot()
+        checkpoint.write(self.folder.last, snapshot)  # shows at once that we can
+        reached = False
+        with tqdm(total=total, initial=self.steps, unit=" steps") as bar:
+            try:
+                while self.steps < total and not reached:
+                    figures = self.update()
+                    snapshot = self.snapshot()
+                    bar.set_postfix_str(_summary(figures))
+                    bar.update(size)
+                    if self._due(self.config.eval_interval) or self.steps >= total:
+                        reached = self._reached(self.evaluate())
+                        self.save()  # the evaluation left the scenes in disorder
+                    elif self._due(self.config.checkpoint_interval):
+                        self.save()
+            except KeyboardInterrupt:
+                checkpoint.write(self.folder.last, snapshot)
+                log.warning("stopped at step %d: resume goes on there", self.steps)
+                raise
+        self.confirm()
+
+    def update(self) -> dict[str, float]:
+        """Collect roll-outs and improve the agent on them."""
+        config, start = self.config, time.perf_counter()
+        self._anneal()
+        torch.set_num_threads(1)  # the cores belong to the simulator's workers
+        self.state, sums = collect(
+            self.envs, self.stack, self.state, self.agent, self.rollout, config.ppo
+        )
+        if config.ppo.normalize_reward:
+            self.rollout.reward = self.reward_scale(
+                self.rollout.reward, self.rollout.done
+            )
+        with torch.inference_mode():
+            last_value = self.agent.value(self.state)
+        self.rollout.finish(last_value, config.ppo.gamma, config.ppo.gae_lambda)
+        collected = time.perf_counter()
+        torch.set_num_threads(config.threads or _cores())
+        figures = ppo.update(self.agent, self.optimizer, self.rollout, config.ppo)
+        if "privileged" in self.rollout.state:
+            self.agent.observe(self.rollout.state["privileged"].flatten(0, 1))
+        self.steps += config.steps_per_update
+        done = time.perf_counter()
+        figures = {f"loss/{name}": value for name, value in figures.items()}
+        figures["std"] = float(self.agent.actor.log_std.exp().mean())
+        figures["time/collect"] = collected - start  # [s]
+        figures["time/update"] = done - collected  # [s]
+        figures = {f"train/{k}": v for k, v in sums.means().items()} | figures
+        self.folder.log("metrics", self.steps, figures)
+        return figures
+
+    def evaluate(self) -> dict[str, float]:
+        """Evaluate the policy on pinned scenes; keep it if it is the best so far."""
+        report = self._report(self.agent, self.config.eval_episodes)
+        figures = _figures(report)
+        self.folder.log("evaluations", self.steps, figures)
+        # Success first; among equals the one that touches only the right object, long.
+        score = sum(figures[f"eval/{k}"] for k in ("worst", "exclusive", "touching"))
+        if score > self.best_score:
+            self.best_score = score
+            self._keep(self.agent, self.steps, report)
+        return figures
+
+    def confirm(self) -> None:
+        """Evaluate the best policy on other scenes than those it was chosen by."""
+        agent, _, metadata = checkpoint.load_policy(self.folder.best)
+        agent.to(self.device)
+        report = self._report(
+            agent, FINAL_EPISODES, seed=self.config.eval_seed + 50_000
+        )
+        self._keep(agent, metadata["steps"], report)
+        text = json.dumps(report.as_dict(), indent=2)
+        (self.folder.path / "evaluation.json").write_text(text + "\n")
+
+    def snapshot(self) -> Stored:
+        """Return everything the run needs to go on, as of now."""
+        tensors, plain = checkpoint.random_state()
+        facts = {
+            "steps": self.steps,
+            "best_score": self.best_score,
+            "reward_scale": self.reward_scale.state_dict(),
+            "random": plain,
+        }
+        metadata = checkpoint.describe(self.agent, self.config, **facts)
+        tensors |= checkpoint.pack(self.agent, self.optimizer)
+        return Stored(checkpoint.CHECKPOINT, tensors, metadata)
+
+    def save(self) -> None:
+        """Write a complete checkpoint, and go on with fresh scenes as a resumed run."""
+        checkpoint.write(self.folder.last, self.snapshot())
+        self.state = self._fresh_scenes()
+
+    def restore(self) -> None:
+        """Go on from the folder's last checkpoint.
+
+        Raises:
+            CheckpointError: if it is broken, or of another task or config.
+        """
+        path = self.folder.last
+        stored = checkpoint.read(path)
+        if stored.kind != checkpoint.CHECKPOINT:
+            raise CheckpointError(
+                f"{path}: got a policy, expected a complete checkpoint to resume from"
+            )
+        try:
+            self._require_same(decode(TrainConfig, stored.metadata["config"]))
+            checkpoint.unpack(stored.tensors, self.agent, self.optimizer)
+            checkpoint.set_random_state(stored.tensors, stored.metadata["random"])
+            self.reward_scale.load_state_dict(stored.metadata["reward_scale"])
+            self.best_score = float(stored.metadata["best_score"])
+            self.steps = int(stored.metadata["steps"])
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            if isinstance(error, CheckpointError):
+                raise
+            raise CheckpointError(
+                f"{path} does not fit this agent: {error}; train anew in another folder"
+            ) from error
+        self.state = self._fresh_scenes()
+
+    def _require_same(self, stored: TrainConfig) -> None:
+        """Raise unless the checkpoint was made with this config."""
+        got, expected = dataclasses.asdict(stored), dataclasses.asdict(self.config)
+        different = [
+            f"{name} (checkpoint: {got[name]!r}, now: {expected[name]!r})"
+            for name in got
+            if name not in MAY_CHANGE and got[name] != expected[name]
+        ]
+        if different:
+            raise CheckpointError(
+                f"{self.folder.last} was made with another config: "
+                + ", ".join(different)
+                + "; resume with the same values, or train in another folder"
+            )
+
+    def _report(
+        self, agent: Agent, episodes: int, seed: int | None = None
+    ) -> EvaluationReport:
+        """Evaluate an agent in the training envs without touching random states."""
+        tensors, plain = checkpoint.random_state()
+        report = evaluate_policy(
+            agent.policy,
+            self.config.env_id,
+            episodes=episodes,
+            seed=self.config.eval_seed if seed is None else seed,
+            num_envs=self.config.num_envs,
+            frames=self.config.frames,
+            env_kwargs=self.config.env_kwargs(training=True),
+            envs=self.envs,
+        )
+        checkpoint.set_random_state(tensors, plain)
+        return report
+
+    def _keep(self, agent: Agent, steps: int, report: EvaluationReport) -> None:
+        """Write the policy as the best one."""
+        figures = report.as_dict()
+        path, config = self.folder.best, self.config
+        checkpoint.save_policy(path, agent, config, steps=steps, evaluation=figures)
+
+    def _fresh_scenes(self) -> State:
+        """Start new episodes whose scenes follow from (seed, steps) alone."""
+        entropy = np.random.SeedSequence([self.config.seed, self.steps])
+        # Half of the seeds, apart from those that evaluations are pinned to.
+        seed = 2**30 + int(entropy.generate_state(1)[0]) % 2**29
+        obs, _ = self.envs.reset(seed=seed)
+        self.reward_scale.restart()
+        return to(self.stack.reset(obs), self.device)
+
+    def _anneal(self) -> None:
+        """Let the action noise shrink linearly with the share of the steps made."""
+        agent = self.config.agent
+        if agent.std_mode == "annealed":
+            share = min(self.steps / self.config.total_steps, 1.0)
+            self.agent.actor.set_std(agent.std + share * (agent.std_final - agent.std))
+
+    def _due(self, interval: int) -> bool:
+        """Whether a multiple of the interval was passed by the last update."""
+        before = self.steps - self.config.steps_per_update
+        return self.steps // interval > before // interval
+
+    def _reached(self, evaluation: dict[str, float]) -> bool:
+        goal = self.config.stop_at_success
+        return goal is not None and evaluation["eval/worst"] >= goal
+
+
+def _figures(report: EvaluationReport) -> dict[str, float]:
+    """Return the figures of an evaluation that are worth a curve."""
+    names = ("success", "exclusive", "touching", "right_fingers", "wrong_fingers")
+    overall = report.overall.as_dict()
+    worst = min(score.success.value for score in report.instructions.values())
+    return {"eval/worst": worst} | {f"eval/{name}": overall[name] for name in names}
+
+
+def _summary(figures: dict[str, float]) -> str:
+    """Return what the progress bar says."""
+    reward, success = figures["train/return"], figures["train/success"]
+    return f"return {reward:.2f}, success {success:.0%}"
+
+
+def _cores() -> int:
+    """Return how many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
