@@ -4,6 +4,7 @@ Importing this package registers the robot `nao` and every task id, and does
 nothing else.
 """
 
+import ir_maniskill.tasks  # noqa: F401 - registers the tasks
 from ir_maniskill.environment.vector import make_vec
 from ir_maniskill.experiment import (
     Experiment,
@@ -14,8 +15,6 @@ from ir_maniskill.experiment import (
     touch_instructions,
 )
 from ir_maniskill.registration import register
-
-import ir_maniskill.tasks  # noqa: E402, F401, I001 - registers the tasks
 
 __all__ = [
     "Experiment",

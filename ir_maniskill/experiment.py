@@ -1,4 +1,4 @@
-"""What one experiment is: objects, instructions, reward, senses (paper, Sec. III-A, IV).
+"""What one experiment is: objects, instructions, reward, senses (Sec. III-A, IV).
 
 An `Experiment` is plain data. The environment reads it, nothing else does; a new
 task is a new `Experiment` handed to `ir_maniskill.register`.

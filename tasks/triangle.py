@@ -1,4 +1,4 @@
-"""Experiment III: a triangle, proprioception, a reward per finger (paper, Sec. IV-C)."""
+"""Experiment III: triangle, proprioception, reward per finger (paper, Sec. IV-C)."""
 
 from ir_maniskill.experiment import Experiment, touch_instructions
 from ir_maniskill.registration import register

@@ -1,4 +1,4 @@
-"""Instructional Set: the sentences i_t, their tokens, and who they name (Sec. III-A)."""
+"""Instructional Set: the sentences i_t, their tokens, what they name (Sec. III-A)."""
 
 from __future__ import annotations
 

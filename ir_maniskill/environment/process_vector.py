@@ -6,6 +6,8 @@ pipes carry only commands. Legend: N envs.
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import multiprocessing as mp
 import os
 import signal
@@ -15,7 +17,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.shared_memory import SharedMemory
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -121,7 +123,7 @@ class ProcessVectorEnv(VectorEnv):
     as always with processes that are not forked.
     """
 
-    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
+    metadata: ClassVar[dict] = {"autoreset_mode": AutoresetMode.SAME_STEP}
     device = torch.device("cpu")
 
     def __init__(
@@ -248,10 +250,8 @@ class ProcessVectorEnv(VectorEnv):
     def close_extras(self, **kwargs: Any) -> None:
         """End all workers; none is left behind, whatever state it is in."""
         for pipe in self._pipes:
-            try:
+            with contextlib.suppress(OSError):
                 pipe.send(("close", None))
-            except OSError:
-                pass
             pipe.close()
         deadline = time.monotonic() + 5.0
         for process in self._processes:
@@ -354,6 +354,9 @@ class _Worker:
         register(experiment)
         self._rows = rows
         self._envs = [gym.make(experiment.id, **env_kwargs) for _ in rows]
+        # ManiSkill collects garbage whenever it rebuilds a scene, which seeded resets
+        # do; what is alive now stays alive, so there is no point in looking at it.
+        gc.freeze()
         self._rng: list = [None] * len(rows)
         self._shared: _SharedTree | None = None
 

@@ -49,7 +49,7 @@ class TouchEnv(BaseEnv):
       the touch is what is rewarded; the time limit does.
     """
 
-    SUPPORTED_ROBOTS = ["nao"]
+    SUPPORTED_ROBOTS = ("nao",)
     SUPPORTED_REWARD_MODES = ("sparse", "dense", "normalized_dense", "none")
     agent: Nao
 
@@ -91,7 +91,7 @@ class TouchEnv(BaseEnv):
     @property
     def _default_sim_config(self) -> SimConfig:
         return SimConfig(
-            sim_freq=200,
+            sim_freq=100,
             control_freq=20,
             scene_config=SceneConfig(contact_offset=0.005),
         )
@@ -185,6 +185,30 @@ class TouchEnv(BaseEnv):
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.as_tensor(array, dtype=torch.float32, device=self.device)
+
+    def reset(
+        self, seed: int | list[int] | None = None, options: dict | None = None
+    ) -> tuple[Any, dict]:
+        """Start an episode; with a seed, in a scene built anew.
+
+        PhysX on the CPU remembers the order in which contacts were made, so that a
+        trajectory depends on earlier episodes in its last bits. A seeded reset
+        therefore rebuilds the scene (some 0.1 s) unless
+        `options["reconfigure"]` is False: then the same seed and actions give the
+        same trajectory, bit for bit, whatever happened before.
+
+        Args:
+            seed: Seeds of the envs; None goes on with their random streams.
+            options: ManiSkill's, and "instruction": indices of the sentences to give,
+                an int or [b] int64, instead of drawing them.
+
+        Raises:
+            ValueError: An instruction index is out of range.
+        """
+        options = dict(options or {})
+        if seed is not None and not self._sim_device.is_cuda():
+            options.setdefault("reconfigure", True)
+        return super().reset(seed, options)
 
     def step(self, action: Any) -> tuple[Any, Tensor, Tensor, Tensor, dict]:
         """Step as ManiSkill does, except that success does not end the episode."""

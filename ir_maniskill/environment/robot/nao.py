@@ -58,7 +58,7 @@ class JointGroup:
     armature: float
     """Rotor inertia seen by the joint; without it light fingers explode [kg m^2]."""
     delta: float
-    """Largest change of the target in one step, as a share of half the joint's range."""
+    """Largest change of the target in one step [half the joint's range]."""
 
 
 ARM = JointGroup(stiffness=20.0, damping=2.0, armature=1e-2, delta=0.15)
