@@ -64,83 +64,129 @@ def parts(frames: Frames) -> dict[str, Part]:
 
 def body(frames: Frames) -> Surface:
     """Returns all that never moves, in the torso's frame."""
-    left = {"LThigh": thigh(), "LTibia": shin(), "l_ankle": foot()}
     pieces = [torso(), head().moved(frames["Head"])]
-    for link, surface in left.items():
-        right = link.replace("L", "R", 1) if link[0] == "L" else link.replace("l", "r", 1)
-        pieces.append(surface.moved(frames[link]))
-        pieces.append(surface.mirrored().moved(frames[right]))
+    for link, surface in (("Thigh", thigh()), ("Tibia", shin()), ("_ankle", foot())):
+        left, right = ("l", "r") if link[0] == "_" else ("L", "R")
+        pieces.append(surface.moved(frames[left + link]))
+        pieces.append(surface.mirrored().moved(frames[right + link]))
     return join(pieces)
 
 
 def torso() -> Surface:
     """Returns the trunk with neck, chest button and sonars."""
-    trunk = loft(
-        "z",
-        [GREY, GREY, WHITE, WHITE, WHITE, WHITE, WHITE, WHITE],
-        [
-            Section(-0.120, (0.030, 0.036), power=2.5),
-            Section(-0.100, (0.042, 0.048), power=2.5),
-            Section(-0.072, (0.047, 0.056), power=2.5),
-            Section(-0.045, (0.045, 0.053), power=2.4),
-            Section(-0.005, (0.050, 0.062), power=2.4),
-            Section(0.045, (0.054, 0.072), power=2.4),
-            Section(0.085, (0.052, 0.074), power=2.4),
-            Section(0.110, (0.042, 0.062), power=2.2),
-            Section(0.122, (0.024, 0.032)),
-        ],
-        segments=16,
-    )
-    trunk = trunk.painted(ORANGE, lambda c: (abs(c[1]) > 0.055) & (c[2] > -0.02))
+    button = knob(
+        [SHELL, GREY, GLOW],
+        [(0, 0.017), (0.005, 0.0145), (0.006, 0.0095)],
+        segments=10,
+    ).shifted(0.051, 0, 0.055)
+    sonar = _spot(DARK, 0.0085, segments=8).turned(0, 0.06, 0.3)
+    sonar = sonar.shifted(0.0525, 0.023, 0.018)
     neck = loft(
         "z",
         GREY,
-        [Section(0.116, (0.021, 0.021)), Section(0.136, (0.019, 0.019))],
+        [Section(0.114, (0.022, 0.022)), Section(0.138, (0.019, 0.019))],
         segments=8,
         caps="none",
     )
-    button = knob([SHELL, GREY, GLOW], [(0, 0.016), (0.004, 0.014), (0.004, 0.010), (0.006, 0.007)], 10)
-    sonar = knob(DARK, [(0, 0.009), (0.002, 0.007)], 8)
-    return join(
+    return join([_trunk(), neck, button, sonar, sonar.mirrored()])
+
+
+def _trunk() -> Surface:
+    shell = loft(
+        "z",
+        [GREY, GREY, WHITE, WHITE, WHITE, WHITE, WHITE, WHITE],
         [
-            trunk,
-            neck,
-            button.shifted(0.051, 0, 0.055),
-            *(sonar.turned(0, 0.05, 0.39 * s).shifted(0.049, s * 0.027, 0.028) for s in (1, -1)),
-        ]
+            Section(-0.122, (0.028, 0.034), power=2.4),
+            Section(-0.104, (0.040, 0.046), power=2.4),
+            Section(-0.076, (0.046, 0.056), power=2.4),
+            Section(-0.042, (0.044, 0.052), power=2.3),
+            Section(-0.004, (0.049, 0.061), power=2.3),
+            Section(0.040, (0.054, 0.072), power=2.3),
+            Section(0.082, (0.053, 0.075), power=2.3),
+            Section(0.108, (0.043, 0.063), power=2.2),
+            Section(0.121, (0.025, 0.034)),
+        ],
+        segments=16,
+    )
+    flank = shell.painted(
+        ORANGE, lambda c: (abs(c[1]) > 0.044) & (c[2] > -0.03) & (c[2] < 0.09)
+    )
+    return flank.painted(
+        SHELL,
+        lambda c: (c[0] < -0.03) & (abs(c[1]) < 0.035) & (c[2] > 0) & (c[2] < 0.09),
     )
 
 
 def head() -> Surface:
     """Returns the round head with eyes, ears, cameras and touch sensors."""
+    camera = knob([SHELL, BLACK], [(0, 0.0075), (0.003, 0.0055)], 8)
+    return join(
+        [
+            _skull(),
+            _eye(),
+            _eye().mirrored(),
+            _ear(),
+            _ear().mirrored(),
+            _crown(),
+            camera.turned(0, -0.35, 0).shifted(0.0585, 0, 0.0790),
+            camera.turned(0, 0.6, 0).shifted(0.0535, 0, 0.0180),
+        ]
+    )
+
+
+def _skull() -> Surface:
     skull = loft(
         "z",
         WHITE,
         [
-            Section(-0.006, (0.020, 0.022)),
-            Section(0.004, (0.042, 0.043), power=2.2),
-            Section(0.024, (0.057, 0.056), power=2.3),
-            Section(0.050, (0.062, 0.060), power=2.3),
-            Section(0.075, (0.059, 0.058), power=2.3),
-            Section(0.096, (0.044, 0.044), power=2.2),
-            Section(0.110, (0.021, 0.021)),
-            Section(0.1135, (0, 0)),
+            Section(-0.008, (0.024, 0.026)),
+            Section(0.003, (0.044, 0.046), power=2.2),
+            Section(0.024, (0.058, 0.060), power=2.3),
+            Section(0.050, (0.0625, 0.0645), power=2.3),
+            Section(0.076, (0.059, 0.060), power=2.3),
+            Section(0.097, (0.043, 0.044), power=2.2),
+            Section(0.109, (0.021, 0.022)),
+            Section(0.112, (0, 0)),
         ],
         segments=16,
         caps="none",
     )
-    eye = knob([BLACK, CYAN, GLOW], [(0, 0.0155), (0.004, 0.0125), (0.0025, 0.0085), (0.0045, 0.004)], 10)
-    ear = knob([SHELL, GREY, WHITE], [(0, 0.029), (0.010, 0.027), (0.010, 0.020), (0.013, 0.013)], 12)
-    camera = knob([SHELL, BLACK], [(0, 0.007), (0.003, 0.006), (0.003, 0.0045)], 8)
-    sides = (1, -1)
-    return join(
+    return skull.painted(
+        ORANGE, lambda c: (c[0] < -0.03) & (abs(c[1]) < 0.03) & (c[2] > 0.03)
+    )
+
+
+def _eye() -> Surface:
+    eye = knob(
+        [BLACK, CYAN, BLACK],
+        [(0, 0.0190), (0.0045, 0.0168), (0.0060, 0.0098)],
+        segments=12,
+    )
+    highlight = _spot(GLOW, 0.0030, segments=5).shifted(0.0065, -0.0035, 0.0045)
+    return join([eye, highlight]).turned(0, -0.04, 0.42).shifted(0.0515, 0.0262, 0.049)
+
+
+def _ear() -> Surface:
+    disc = knob(
+        [SHELL, GREY, WHITE],
+        [(0, 0.030), (0.0095, 0.0275), (0.0110, 0.0200)],
+        segments=12,
+    )
+    return disc.turned(0, 0, np.pi / 2).shifted(-0.006, 0.0585, 0.050)
+
+
+def _crown() -> Surface:
+    """Returns the three touch sensors on top of the head, front to back."""
+    return loft(
+        "x",
+        [GREY, DARK, GREY],
         [
-            skull,
-            *(eye.turned(0, -0.05, 0.42 * s).shifted(0.0525, s * 0.0257, 0.0500) for s in sides),
-            *(ear.turned(0, 0, s * np.pi / 2).shifted(-0.004, s * 0.0575, 0.050) for s in sides),
-            camera.turned(0, -0.35, 0).shifted(0.0575, 0, 0.0775),
-            camera.turned(0, 0.6, 0).shifted(0.0535, 0, 0.019),
-        ]
+            Section(-0.036, (0.009, 0.004), (0, 0.0985)),
+            Section(-0.014, (0.013, 0.006), (0, 0.1095)),
+            Section(0.014, (0.013, 0.006), (0, 0.1095)),
+            Section(0.036, (0.009, 0.004), (0, 0.0985)),
+        ],
+        segments=6,
     )
 
 
@@ -150,16 +196,22 @@ def thigh() -> Surface:
         "z",
         WHITE,
         [
-            Section(-0.092, (0.026, 0.024)),
-            Section(-0.070, (0.032, 0.028), (0.002, 0.002), 2.4),
+            Section(-0.094, (0.023, 0.022)),
+            Section(-0.074, (0.031, 0.028), (0.002, 0.002), 2.4),
             Section(-0.030, (0.037, 0.032), (0.002, 0.004), 2.4),
-            Section(0.000, (0.036, 0.031), (0, 0.004), 2.4),
-            Section(0.020, (0.022, 0.022), (0, 0.002)),
+            Section(-0.002, (0.036, 0.031), (0, 0.004), 2.4),
+            Section(0.022, (0.022, 0.021), (-0.004, 0.002)),
         ],
         caps="high",
     )
-    shell = shell.painted(ORANGE, lambda c: (c[1] > 0.02) & (c[2] > -0.06))
-    drum = loft("y", GREY, [Section(-0.026, (0.024, 0.024)), Section(0.028, (0.024, 0.024))])
+    shell = shell.painted(
+        ORANGE, lambda c: (c[1] > 0.021) & (c[2] > -0.06) & (c[2] < 0)
+    )
+    drum = loft(
+        "y",
+        GREY,
+        [Section(-0.026, (0.0235, 0.0235)), Section(0.029, (0.0235, 0.0235))],
+    ).painted(ORANGE, lambda c: c[1] > 0.028)
     return join([shell, drum.shifted(0, 0, -0.1)])
 
 
@@ -169,11 +221,11 @@ def shin() -> Surface:
         "z",
         [GREY, WHITE, WHITE, WHITE],
         [
-            Section(-0.108, (0.024, 0.024)),
-            Section(-0.092, (0.032, 0.030), (0, 0.001), 2.3),
-            Section(-0.055, (0.037, 0.033), (-0.002, 0.002), 2.4),
-            Section(-0.022, (0.033, 0.030), (0.001, 0.002), 2.4),
-            Section(0.012, (0.024, 0.022), (0.008, 0)),
+            Section(-0.110, (0.023, 0.023)),
+            Section(-0.094, (0.033, 0.031), (0, 0.001), 2.3),
+            Section(-0.062, (0.038, 0.034), (-0.001, 0.002), 2.4),
+            Section(-0.028, (0.033, 0.030), (0.002, 0.002), 2.4),
+            Section(-0.008, (0.022, 0.024), (0.005, 0.001)),
         ],
         caps="high",
     )
@@ -185,13 +237,13 @@ def foot() -> Surface:
         "z",
         [DARK, WHITE, WHITE, GREY],
         [
-            Section(-0.04511, (0.078, 0.032), (0.022, 0.002), 3.0),
-            Section(-0.038, (0.080, 0.034), (0.022, 0.002), 3.0),
-            Section(-0.024, (0.070, 0.032), (0.018, 0.002), 2.6),
-            Section(-0.010, (0.044, 0.029), (0.004, 0.001), 2.2),
-            Section(0.010, (0.026, 0.024)),
+            Section(-0.04511, (0.078, 0.033), (0.022, 0.002), 3.0),
+            Section(-0.038, (0.080, 0.035), (0.022, 0.002), 3.0),
+            Section(-0.022, (0.071, 0.033), (0.018, 0.002), 2.6),
+            Section(-0.008, (0.043, 0.029), (0.004, 0.001), 2.2),
+            Section(0.012, (0.024, 0.024)),
         ],
-        segments=14,
+        segments=12,
         caps="none",
     )
 
@@ -202,10 +254,11 @@ def shoulder() -> Surface:
         "y",
         [GREY, DARK],
         [
-            Section(-0.040, (0.027, 0.027)),
-            Section(-0.022, (0.029, 0.029)),
+            Section(-0.042, (0.026, 0.026)),
+            Section(-0.024, (0.029, 0.029)),
             Section(-0.010, (0.022, 0.022)),
         ],
+        segments=12,
         caps="none",
     )
 
@@ -216,14 +269,14 @@ def bicep() -> Surface:
         "x",
         WHITE,
         [
-            Section(-0.037, (0, 0)),
-            Section(-0.028, (0.021, 0.022), (0.002, 0)),
-            Section(-0.006, (0.031, 0.033), (0.003, 0)),
-            Section(0.026, (0.030, 0.031), (0.008, 0)),
-            Section(0.064, (0.022, 0.023), (0.015, 0)),
+            Section(-0.0360, (0, 0)),
+            Section(-0.0290, (0.018, 0.019), (0.001, 0)),
+            Section(-0.0120, (0.030, 0.031), (0.002, 0)),
+            Section(0.0200, (0.031, 0.032), (0.007, 0)),
+            Section(0.0640, (0.0225, 0.0235), (0.015, 0)),
         ],
     )
-    return shell.painted(ORANGE, lambda c: (c[1] > 0.016) & (c[0] < 0.04))
+    return shell.painted(ORANGE, lambda c: (c[1] > 0.016) & (abs(c[0]) < 0.03))
 
 
 def elbow() -> Surface:
@@ -231,11 +284,15 @@ def elbow() -> Surface:
     sleeve = loft(
         "x",
         SHELL,
-        [Section(-0.043, (0.0195, 0.0195)), Section(-0.008, (0.0215, 0.0215)), Section(0.012, (0.014, 0.014))],
+        [
+            Section(-0.043, (0.0190, 0.0190)),
+            Section(-0.010, (0.0205, 0.0205)),
+            Section(0.012, (0.013, 0.013)),
+        ],
         caps="none",
     )
-    drum = loft("z", GREY, [Section(-0.024, (0.016, 0.016)), Section(0.024, (0.016, 0.016))], 8)
-    return join([sleeve, drum])
+    rims = [Section(z, (0.0165, 0.0165)) for z in (-0.0225, 0.0225)]
+    return join([sleeve, loft("z", GREY, rims, segments=10)])
 
 
 def forearm() -> Surface:
@@ -244,12 +301,13 @@ def forearm() -> Surface:
         "x",
         [WHITE, WHITE, WHITE, ORANGE],
         [
-            Section(0.004, (0.017, 0.017), (0.002, 0)),
-            Section(0.014, (0.025, 0.025), (0.002, 0)),
-            Section(0.034, (0.027, 0.027), (0.002, 0)),
-            Section(0.047, (0.0245, 0.0245)),
-            Section(0.053, (0.0235, 0.0235)),
+            Section(0.005, (0.015, 0.015), (0.001, 0)),
+            Section(0.014, (0.024, 0.024), (0.002, 0)),
+            Section(0.032, (0.027, 0.027), (0.002, 0)),
+            Section(0.046, (0.0250, 0.0250), (0.001, 0)),
+            Section(0.053, (0.0240, 0.0240)),
         ],
+        lid=GREY,
     )
 
 
@@ -261,34 +319,48 @@ def hand() -> Surface:
         [
             Section(-0.004, (0.019, 0.019)),
             Section(0.010, (0.021, 0.021)),
-            Section(0.026, (0.025, 0.023), (0, 0.001), 2.4),
-            Section(0.050, (0.026, 0.022), (0, 0.001), 2.6),
-            Section(0.066, (0.021, 0.013), (0, 0.001), 2.6),
+            Section(0.028, (0.026, 0.025), (0, 0), 2.4),
+            Section(0.053, (0.026, 0.024), (0, -0.002), 2.5),
+            Section(0.067, (0.021, 0.011), (0, -0.001), 2.5),
         ],
         caps="high",
+        lid=GREY,
     )
-    return palm.painted(GREY, lambda c: (c[2] < -0.008) & (c[0] > 0.015))
+    return palm.painted(GREY, lambda c: (c[2] < -0.008) & (c[0] > 0.012))
 
 
 def phalanx() -> Surface:
     """Returns an inner phalanx, along x."""
-    return _finger_segment([SHELL] * 3, 0.0125)
+    return loft(
+        "x",
+        SHELL,
+        [
+            Section(-0.0058, (0, 0)),
+            Section(-0.0005, (0.0059, 0.0059)),
+            Section(0.0130, (0.0059, 0.0059)),
+            Section(0.0188, (0, 0)),
+        ],
+        segments=6,
+        caps="none",
+    )
 
 
 def fingertip() -> Surface:
-    """Returns the last phalanx, with its dark tip."""
-    return _finger_segment([SHELL, SHELL, DARK], 0.0095)
-
-
-def _finger_segment(colors: Sequence[int], shaft: float) -> Surface:
+    """Returns the last phalanx; its open foot hides in the one before."""
     return loft(
         "x",
-        colors,
+        [SHELL, DARK, DARK],
         [
-            Section(-0.005, (0, 0)),
-            Section(0.001, (0.0058, 0.0058)),
-            Section(shaft, (0.0058, 0.0058)),
-            Section(0.0172, (0, 0)),
+            Section(-0.0025, (0.0052, 0.0052)),
+            Section(0.0080, (0.0060, 0.0060)),
+            Section(0.0142, (0.0046, 0.0046)),
+            Section(0.0170, (0, 0)),
         ],
-        segments=7,
+        segments=6,
+        caps="none",
     )
+
+
+def _spot(color: int, radius: float, segments: int) -> Surface:
+    """Returns a flat disc at the origin that looks along +x."""
+    return knob([color], [(0, radius)], segments)

@@ -19,7 +19,7 @@ from trimesh.visual.material import PBRMaterial
 
 _SWATCH_WIDTH = 8  # [px] wide, so that filtering does not mix neighboring colors
 _LEVELS = 16  # brightness levels of the palette
-_DARKEST = 0.58  # brightness of what faces away from the light
+_DARKEST = 0.64  # brightness of what faces away from the light
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,8 @@ class Surface:
     """Index into the palette, shape [F]."""
     groups: np.ndarray
     """Smoothing group, shape [F]."""
+    cells: np.ndarray
+    """Which flat cell, a quadrilateral or a lid, the face is a part of, shape [F]."""
 
     def moved(self, frame: np.ndarray) -> "Surface":
         """Returns the surface carried by the homogeneous transform `frame`."""
@@ -72,24 +74,27 @@ class Surface:
     def painted(
         self, color: int, where: Callable[[np.ndarray], np.ndarray]
     ) -> "Surface":
-        """Returns the surface with another color where the face centers say so."""
+        """Returns the surface with other cells colored.
+
+        Args:
+            color: The new color.
+            where: Given x, y, z of the cells' middles, stacked, says which.
+        """
         centers = self.vertices[self.faces].mean(axis=1)  # [F, 3]
-        return replace(self, colors=np.where(where(centers.T), color, self.colors))
+        sums = np.zeros((self.cells.max() + 1, 3))
+        np.add.at(sums, self.cells, centers)
+        middles = (sums / np.bincount(self.cells)[:, None])[self.cells]  # [F, 3]
+        return replace(self, colors=np.where(where(middles.T), color, self.colors))
 
 
 def join(surfaces: Sequence[Surface]) -> Surface:
     """Returns the surfaces as one, their smoothing groups kept apart."""
-    corner = np.cumsum([0, *(len(part.vertices) for part in surfaces)])
-    group = np.cumsum([0, *(part.groups.max() + 1 for part in surfaces)])
     return Surface(
         np.concatenate([part.vertices for part in surfaces]),
-        np.concatenate(
-            [p.faces + n for p, n in zip(surfaces, corner[:-1], strict=True)]
-        ),
+        _renumbered([p.faces for p in surfaces], [len(p.vertices) for p in surfaces]),
         np.concatenate([part.colors for part in surfaces]),
-        np.concatenate(
-            [p.groups + n for p, n in zip(surfaces, group[:-1], strict=True)]
-        ),
+        _renumbered([p.groups for p in surfaces], [p.groups.max() + 1 for p in surfaces]),
+        _renumbered([p.cells for p in surfaces], [p.cells.max() + 1 for p in surfaces]),
     )
 
 
@@ -99,6 +104,7 @@ def loft(
     sections: Sequence[Section],
     segments: int = 10,
     caps: str = "both",
+    lid: int | None = None,
 ) -> Surface:
     """Returns the skin over a row of cross sections.
 
@@ -119,24 +125,26 @@ def loft(
     for span, color in enumerate(colors):
         builder.add_span(span, color, sections[span].crease)
     if caps in ("low", "both") and any(sections[0].half):
-        builder.add_lid(0, sections[0], colors[0])
+        color = colors[0] if lid is None else lid
+        builder.add_lid(0, sections[0], color, up=False)
     if caps in ("high", "both") and any(sections[-1].half):
-        builder.add_lid(spans, sections[-1], colors[-1])
+        color = colors[-1] if lid is None else lid
+        builder.add_lid(spans, sections[-1], color, up=True)
     return builder.surface("xyz".index(axis))
 
 
 def knob(
-    colors: int | Sequence[int], profile: Sequence[tuple[float, float]], segments: int
+    colors: Sequence[int], profile: Sequence[tuple[float, float]], segments: int
 ) -> Surface:
     """Returns a round knob standing on the origin along +x.
 
     Args:
-        colors: One color, or one per span of the profile.
+        colors: One per span of the profile, and one for the lid.
         profile: (height, radius) pairs [m] from the foot up; the foot stays open.
         segments: Points per ring.
     """
     rings = [Section(height, (radius, radius)) for height, radius in profile]
-    return loft("x", colors, rings, segments, caps="high")
+    return loft("x", colors[:-1], rings, segments, caps="high", lid=colors[-1])
 
 
 def palette(colors: Sequence[tuple[int, int, int]]) -> Image.Image:
@@ -185,6 +193,12 @@ def bake(
     )
 
 
+def _renumbered(indices: Sequence[np.ndarray], counts: Sequence[int]) -> np.ndarray:
+    """Returns the index arrays as one, each shifted past those before it."""
+    shifts = np.cumsum([0, *counts[:-1]])
+    return np.concatenate([i + n for i, n in zip(indices, shifts, strict=True)])
+
+
 def _tags(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
     return surface.groups, surface.colors
 
@@ -210,7 +224,9 @@ class _Builder:
         self._faces: list[tuple[int, int, int]] = []
         self._colors: list[int] = []
         self._groups: list[int] = []
+        self._cells: list[int] = []
         self._group = 0
+        self._cell = 0
 
     def add_ring(self, section: Section) -> None:
         """Adds the points of a section, or the one point of a closed end."""
@@ -229,21 +245,23 @@ class _Builder:
     def add_span(self, span: int, color: int, crease: bool) -> None:
         """Adds the skin between section `span` and the next."""
         self._group += crease
-        low, high = self._rings[span], self._rings[span + 1]
+        low, high = self._rings[span : span + 2]
         for i in range(self._segments):
             j = (i + 1) % self._segments
             self._add_face((low[i], low[j], high[j]), color)
             self._add_face((low[i], high[j], high[i]), color)
+            self._cell += 1
 
-    def add_lid(self, ring: int, section: Section, color: int) -> None:
-        """Adds a flat lid on an end section, with a hard edge."""
+    def add_lid(self, ring: int, section: Section, color: int, up: bool) -> None:
+        """Adds a flat lid that looks up or down the axis, with a hard edge."""
         self._group += 1
         center = len(self._vertices)
         self._vertices.append(np.array([section.at, *section.center]))
         points = self._rings[ring]
-        points = points[::-1] if ring == 0 else points
+        points = points if up else points[::-1]
         for a, b in zip(points, np.roll(points, -1), strict=True):
             self._add_face((a, b, center), color)
+        self._cell += 1
 
     def surface(self, axis: int) -> Surface:
         """Returns the surface with w along the given axis."""
@@ -252,6 +270,7 @@ class _Builder:
             np.array(self._faces),
             np.array(self._colors),
             np.array(self._groups),
+            np.array(self._cells),
         )
 
     def _add_face(self, corners: tuple[int, int, int], color: int) -> None:
@@ -259,3 +278,4 @@ class _Builder:
             self._faces.append(corners)
             self._colors.append(color)
             self._groups.append(self._group)
+            self._cells.append(self._cell)
