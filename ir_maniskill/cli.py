@@ -1,0 +1,317 @@
+"""The command line: ``ir-maniskill tasks | train | evaluate | video | doctor``."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import logging
+import sys
+import warnings
+from collections.abc import Callable, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from tyro.conf import Positional, arg, subcommand
+
+from ir_maniskill import doctor
+from ir_maniskill import experiment as catalog
+from ir_maniskill.experiment import Experiment
+from ir_maniskill.training import plots, video
+from ir_maniskill.training.checkpoint import load_policy
+from ir_maniskill.training.config import CONFIGS, TrainConfig
+from ir_maniskill.training.evaluate import evaluate_policy, write_report
+from ir_maniskill.training.train import train
+
+TaskId = Positional[Annotated[str, arg(metavar="ID")]]
+
+
+class UsageError(ValueError):
+    """A request that cannot be carried out: says what was got and what is possible."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Tasks:
+    """List the tasks."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainOptions(TrainConfig):
+    """A training configuration whose task is given by place."""
+
+    env_id: TaskId = ""
+    """Task to learn, e.g. NaoTouchCubeSingle-v1."""
+    out: str = ""
+    """Folder of the run; runs/ID if empty."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Train:
+    """Train an agent."""
+
+    config: Annotated[TrainOptions, arg(name="")]
+    preset: Literal["default", "paper"] = "default"
+    """Which numbers to start from: ours or the paper's."""
+    resume: bool = False
+    """Go on from the last checkpoint of the folder, if there is one."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluate:
+    """Evaluate a policy: success, exclusive success and touch, per instruction."""
+
+    env_id: TaskId
+    """Task, e.g. NaoTouchCubeSingle-v1."""
+    checkpoint: Path | None = None
+    """Policy or checkpoint file; None: the one that ships with the package."""
+    episodes: int = 100
+    """Episodes, spread evenly over the instructions."""
+    seed: int = 2_000_000
+    """Seed of the first episode; episode e starts from seed + e."""
+    num_envs: int = 8
+    """Scenes simulated side by side; on a CPU the result is the same for any number."""
+    json: Path | None = None
+    """File to write the report to."""
+    instruction: str | None = None
+    """Evaluate this sentence only; None: all of the task's."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Video:
+    """Make a video of a policy (.mp4, or .gif)."""
+
+    env_id: TaskId
+    """Task, e.g. NaoTouchCubeSingle-v1."""
+    checkpoint: Path | None = None
+    """Policy or checkpoint file; None: the one that ships with the package."""
+    out: Path | None = None
+    """File to write; None: runs/ID.mp4."""
+    episodes: int = 3
+    """Episodes; the instructions take turns."""
+    seed: int = 2_000_000
+    """Seed of the first episode; episode e starts from seed + e."""
+    speed: float = 0.5
+    """How fast to play; 1 is real time."""
+    instruction: str | None = None
+    """Show this sentence only; None: all of the task's."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Curve:
+    """Draw the learning curve of a run (.png)."""
+
+    run: Positional[Annotated[Path, arg(metavar="FOLDER")]]
+    """Folder of the run."""
+    out: Path | None = None
+    """File to write; None: learning_curve.png in that folder."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Doctor:
+    """Say whether this machine can render, and what to install if not."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Runs the command line and exits with its code.
+
+    The code is 0 if all went well, 1 if the doctor found a fault, 2 for a request that
+    cannot be carried out, and 130 after Ctrl-C.
+    """
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    warnings.filterwarnings("ignore", module=r"(mani_skill|sapien|gymnasium)\b.*")
+    sys.exit(run(sys.argv[1:] if arguments is None else arguments))
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Carries out one command and returns its exit code."""
+    try:
+        command = parse(arguments)
+        return _COMMANDS[type(command)](command)
+    except KeyboardInterrupt:
+        return 130
+    except (ValueError, RuntimeError, OSError, catalog.UnknownExperimentError) as error:
+        print(f"ir-maniskill: error: {error}", file=sys.stderr)
+        return 2
+
+
+def parse(arguments: Sequence[str]) -> Any:
+    """Returns the command that the arguments ask for.
+
+    A preset gives the defaults of the other options of `train`, hence the look ahead.
+    """
+    ahead = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    ahead.add_argument("--preset", choices=CONFIGS, default="default")
+    try:
+        preset = ahead.parse_known_args(list(arguments))[0].preset
+    except SystemExit:
+        raise UsageError(f"--preset: expected one of {', '.join(CONFIGS)}") from None
+    numbers = {f.name: getattr(CONFIGS[preset], f.name) for f in _TRAIN_FIELDS}
+    options = TrainOptions(**{**numbers, "env_id": tyro.MISSING, "out": ""})
+    commands = (
+        Annotated[Tasks, subcommand("tasks")]
+        | Annotated[Train, subcommand("train", default=Train(options, preset))]
+        | Annotated[Evaluate, subcommand("evaluate")]
+        | Annotated[Video, subcommand("video")]
+        | Annotated[Curve, subcommand("curve")]
+        | Annotated[Doctor, subcommand("doctor")]
+    )
+    return tyro.cli(  # type: ignore[call-overload]
+        commands, args=list(arguments), prog="ir-maniskill", description=_DESCRIPTION
+    )
+
+
+# -- Commands ------------------------------------------------------------------------
+
+
+def _tasks(_: Tasks) -> int:
+    rows = [("ID", "SENTENCES", "OBJECTS", "REWARD", "SENSES")]
+    rows += [_describe(catalog.get(name)) for name in catalog.available()]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        print("  ".join(cells).rstrip())
+    return 0
+
+
+def _describe(experiment: Experiment) -> tuple[str, ...]:
+    """Returns the row of an experiment in the table of tasks."""
+    sentences = experiment.sentences
+    more = f" (+{len(sentences) - 1})" if len(sentences) > 1 else ""
+    colors = ", ".join(thing.color for thing in experiment.objects)
+    places = "shuffled" if experiment.shuffled else "in place"
+    reward = {"binary": "+1 if touched", "per_finger": "+1 a finger"}
+    penalty = (
+        f", -{experiment.wrong_penalty:g} wrong" if experiment.wrong_penalty else ""
+    )
+    return (
+        experiment.id,
+        sentences[0] + more,
+        f"{colors}; {places}",
+        reward[experiment.reward] + penalty,
+        ", ".join(experiment.senses),
+    )
+
+
+def _train(command: Train) -> int:
+    options = command.config
+    numbers = {f.name: getattr(options, f.name) for f in _TRAIN_FIELDS}
+    config = TrainConfig(**numbers)
+    catalog.get(config.env_id)
+    config = dataclasses.replace(config, out=config.out or f"runs/{config.env_id}")
+    best = train(config, resume=command.resume)
+    print(f"The best policy is in {best}.")
+    print(f"Next: ir-maniskill evaluate {config.env_id} --checkpoint {best}")
+    return 0
+
+
+def _evaluate(command: Evaluate) -> int:
+    task = catalog.get(command.env_id)
+    _require("num-envs", command.num_envs, least=1)
+    chosen = _find_instruction(task, command.instruction)
+    path = _find_policy(task, command.checkpoint)
+    agent, config, facts = load_policy(path)
+    report = evaluate_policy(
+        agent.policy,
+        task.id,
+        episodes=command.episodes,
+        seed=command.seed,
+        num_envs=command.num_envs,
+        frames=config.frames,
+        env_kwargs=config.env_kwargs(training=False),
+        instructions=chosen,
+        progress=True,
+    )
+    print(report)
+    if command.json is not None:
+        about = {"checkpoint": str(path), "trained_steps": facts.get("steps")}
+        settings = dataclasses.asdict(config)
+        write_report(command.json, report, **about, config=settings)
+    return 0
+
+
+def _video(command: Video) -> int:
+    task = catalog.get(command.env_id)
+    _require("episodes", command.episodes, least=1)
+    if not 0.05 <= command.speed <= 4:
+        raise UsageError(f"speed: got {command.speed:g}, expected 0.05 to 4")
+    chosen = _find_instruction(task, command.instruction)
+    agent, config, _ = load_policy(_find_policy(task, command.checkpoint))
+    out = command.out or Path("runs") / f"{task.id}.mp4"
+    snapshots = video.record(
+        agent.policy,
+        task.id,
+        episodes=command.episodes,
+        seed=command.seed,
+        frames=config.frames,
+        env_kwargs=config.env_kwargs(training=False),
+        instructions=chosen,
+    )
+    video.write_video(out, snapshots, speed=command.speed)
+    print(f"The video is in {out}.")
+    return 0
+
+
+def _curve(command: Curve) -> int:
+    out = plots.learning_curve(command.run, command.out)
+    print(f"The learning curve is in {out}.")
+    return 0
+
+
+def _doctor(_: Doctor) -> int:
+    return doctor.main([])
+
+
+# -- What the commands share ---------------------------------------------------------
+
+
+def _find_policy(task: Experiment, given: Path | None) -> Path:
+    """Returns the policy file to use: the one given, or the shipped one."""
+    if given is not None:
+        if not given.is_file():
+            raise UsageError(f"--checkpoint: got {given}, expected an existing file")
+        return given
+    folder = resources.files("ir_maniskill.assets") / "policies"
+    shipped = Path(str(folder / f"{task.id}.safetensors"))
+    if not shipped.is_file():
+        raise UsageError(
+            f"no policy for {task.id}: none was given and none ships with the package "
+            f"(looked for {shipped}). Train one: ir-maniskill train {task.id}; then "
+            f"add --checkpoint runs/{task.id}/best.safetensors"
+        )
+    return shipped
+
+
+def _find_instruction(task: Experiment, text: str | None) -> tuple[int, ...] | None:
+    """Returns the index of a sentence of the task; None: all of them."""
+    if text is None:
+        return None
+    known = [sentence.lower().rstrip(".") for sentence in task.sentences]
+    wanted = text.lower().strip().rstrip(".")
+    if wanted not in known:
+        listed = ", ".join(map(repr, task.sentences))
+        raise UsageError(f"--instruction: got {text!r}, available: {listed}")
+    return (known.index(wanted),)
+
+
+def _require(name: str, value: int, least: int) -> None:
+    if value < least:
+        raise UsageError(f"--{name}: got {value}, expected at least {least}")
+
+
+_DESCRIPTION = "InstructRobot: a NAO humanoid learns to touch what a sentence names."
+
+_TRAIN_FIELDS = dataclasses.fields(TrainConfig)
+
+_COMMANDS: dict[type, Callable[[Any], int]] = {
+    Tasks: _tasks,
+    Train: _train,
+    Evaluate: _evaluate,
+    Video: _video,
+    Curve: _curve,
+    Doctor: _doctor,
+}
+
+
+if __name__ == "__main__":
+    main()

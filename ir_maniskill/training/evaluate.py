@@ -1,0 +1,344 @@
+"""Evaluation: how reliably a policy touches what the sentence names.
+
+Every episode is pinned by a seed of its own, and the policy acts on each env alone, so
+the figures depend on neither the number of envs nor the order of the episodes.
+
+Legend: N envs, E episodes, I instructions.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import platform
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from ir_maniskill.environment.process_vector import ProcessVectorEnv
+from ir_maniskill.environment.state import StateStack
+from ir_maniskill.environment.vector import GpuVectorEnv, make_vec
+
+Policy = Callable[[dict[str, Tensor]], Tensor]
+"""Maps the state s_t of N envs to their actions [N, 26] in [-1, 1]."""
+VectorEnv = GpuVectorEnv | ProcessVectorEnv
+
+Z_95 = 1.959963984540054
+"""Two-sided 95% quantile of the normal distribution."""
+
+
+@dataclass(frozen=True)
+class Rate:
+    """Share of episodes, with how sure it is."""
+
+    count: int
+    """Episodes in which it happened."""
+    total: int
+    """Episodes played."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.count <= self.total or self.total < 1:
+            raise ValueError(
+                f"rate: got {self.count} of {self.total}, expected 0 <= count <= total "
+                "and at least one episode"
+            )
+
+    @property
+    def value(self) -> float:
+        """The share itself."""
+        return self.count / self.total
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Wilson's 95% confidence interval of the share."""
+        n, p, z = self.total, self.value, Z_95
+        center = (p + z * z / (2 * n)) / (1 + z * z / n)
+        half = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n)) / (1 + z * z / n)
+        return max(0.0, center - half), min(1.0, center + half)
+
+    def __str__(self) -> str:
+        low, high = self.interval
+        return f"{100 * self.value:5.1f}% [{100 * low:4.1f}, {100 * high:5.1f}]"
+
+
+@dataclass(frozen=True)
+class Score:
+    """What the policy did over a set of episodes."""
+
+    success: Rate
+    """Episodes in which the named object was touched."""
+    exclusive: Rate
+    """Episodes in which it was, and no other object at any step."""
+    touching: float
+    """Share of steps in which the named object is touched."""
+    right_fingers: float
+    """Fingers on the named object, mean over steps."""
+    wrong_fingers: float
+    """Fingers on other objects, mean over steps."""
+    mean_return: float
+    """Sum of the rewards of an episode, mean over episodes."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Returns plain data for JSON."""
+        return {
+            "episodes": self.success.total,
+            "success": self.success.value,
+            "success_interval": list(self.success.interval),
+            "exclusive": self.exclusive.value,
+            "exclusive_interval": list(self.exclusive.interval),
+            "touching": self.touching,
+            "right_fingers": self.right_fingers,
+            "wrong_fingers": self.wrong_fingers,
+            "return": self.mean_return,
+        }
+
+
+@dataclass(frozen=True)
+class EvaluationReport:
+    """The scores of a policy on one task."""
+
+    env_id: str
+    """The task."""
+    seed: int
+    """Seed of the first episode; episode e has seed + e."""
+    episodes: int
+    """Episodes played."""
+    instructions: dict[str, Score]
+    """Score of each sentence."""
+    overall: Score
+    """Score over all episodes."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Returns plain data for JSON."""
+        return {
+            "env_id": self.env_id,
+            "seed": self.seed,
+            "episodes": self.episodes,
+            "instructions": {k: v.as_dict() for k, v in self.instructions.items()},
+            "overall": self.overall.as_dict(),
+        }
+
+    def __str__(self) -> str:
+        rows = [*self.instructions.items()]
+        if len(rows) > 1:
+            rows.append(("all", self.overall))
+        width = max(len(name) for name, _ in rows)
+        head = (
+            f"{'instruction':<{width}}     N  success [95%]         "
+            "exclusive [95%]       touching  fingers right/wrong  return"
+        )
+        return "\n".join([head, *(_row(name, score, width) for name, score in rows)])
+
+
+def _row(name: str, score: Score, width: int) -> str:
+    return (
+        f"{name:<{width}} {score.success.total:>5}  {score.success!s:<20}  "
+        f"{score.exclusive!s:<20}  {100 * score.touching:>7.1f}%  "
+        f"{score.right_fingers:>11.2f} / {score.wrong_fingers:<5.2f}  "
+        f"{score.mean_return:>6.2f}"
+    )
+
+
+@dataclass
+class _Record:
+    """Per-episode sums over the steps, E episodes."""
+
+    episodes: int
+    success: Tensor = field(init=False)  # [E]
+    exclusive: Tensor = field(init=False)  # [E]
+    sums: Tensor = field(init=False)  # [E,5]: see SUMS
+
+    SUMS = ("steps", "touching", "right_fingers", "wrong_fingers", "return")
+
+    def __post_init__(self) -> None:
+        self.success = torch.zeros(self.episodes, dtype=torch.bool)
+        self.exclusive = torch.zeros(self.episodes, dtype=torch.bool)
+        self.sums = torch.zeros(self.episodes, len(self.SUMS), dtype=torch.float64)
+
+    def add(
+        self, episode: Tensor, env: Tensor, reward: Tensor, info: dict[str, Tensor]
+    ) -> None:
+        """Counts one step of the episodes that the chosen envs play."""
+        right, wrong = (
+            info["right_fingers"][env].cpu(),
+            info["wrong_fingers"][env].cpu(),
+        )
+        step = (torch.ones_like(right), right > 0, right, wrong, reward[env].cpu())
+        self.sums[episode] += torch.stack([x.double() for x in step], dim=1)
+        self.success[episode] = info["success_once"][env].cpu()
+        self.exclusive[episode] = info["exclusive_success"][env].cpu()
+
+    def score(self, chosen: Tensor) -> Score:
+        """Returns the score of the chosen episodes [E] bool."""
+        total = int(chosen.sum())
+        sums = dict(zip(self.SUMS, self.sums[chosen].sum(dim=0).tolist(), strict=True))
+        return Score(
+            success=Rate(int(self.success[chosen].sum()), total),
+            exclusive=Rate(int(self.exclusive[chosen].sum()), total),
+            touching=sums["touching"] / sums["steps"],
+            right_fingers=sums["right_fingers"] / sums["steps"],
+            wrong_fingers=sums["wrong_fingers"] / sums["steps"],
+            mean_return=sums["return"] / total,
+        )
+
+
+def evaluate_policy(
+    policy: Policy,
+    env_id: str,
+    *,
+    episodes: int,
+    seed: int,
+    num_envs: int = 8,
+    frames: int = 3,
+    env_kwargs: dict[str, Any] | None = None,
+    envs: VectorEnv | None = None,
+    instructions: Sequence[int] | None = None,
+    progress: bool = False,
+) -> EvaluationReport:
+    """Plays episodes with a policy and counts what it touches.
+
+    Episodes are spread evenly over the instructions: episode e is told instruction
+    e modulo their number, and starts from seed + e.
+
+    Args:
+        policy: Acts without noise on the state s_t.
+        env_id: The task.
+        episodes: How many episodes; at least one for each instruction.
+        seed: Seed of the first episode.
+        num_envs: Envs to make, unless `envs` are given.
+        frames: S, observations stacked into a state.
+        env_kwargs: Keyword arguments for the envs (obs_mode, control_mode, ...).
+        envs: Envs to use, and to leave open, instead of making some.
+        instructions: Which of the experiment's instructions; None: all.
+        progress: Whether to show a progress bar.
+
+    Raises:
+        ValueError: Too few episodes, or an instruction that the task does not have.
+    """
+    if envs is None:
+        _check_episodes(episodes)
+        # More envs than episodes would only play what nobody counts.
+        envs = make_vec(env_id, min(num_envs, episodes), **(env_kwargs or {}))
+        scope: contextlib.AbstractContextManager[Any] = contextlib.closing(envs)
+    else:
+        scope = contextlib.nullcontext(envs)
+    with scope:
+        sentences = tuple(envs.experiment.sentences)
+        chosen = _choose_instructions(sentences, instructions, episodes)
+        told = torch.tensor([chosen[e % len(chosen)] for e in range(episodes)])  # [E]
+        record = _play(policy, envs, told, seed, StateStack(frames), progress)
+    return EvaluationReport(
+        env_id=env_id,
+        seed=seed,
+        episodes=episodes,
+        instructions={sentences[i]: record.score(told == i) for i in chosen},
+        overall=record.score(torch.ones(episodes, dtype=torch.bool)),
+    )
+
+
+def write_report(path: Path, report: EvaluationReport, **facts: Any) -> None:
+    """Writes the report as JSON, with the versions and the machine it was made on.
+
+    Args:
+        path: The file.
+        report: What was measured.
+        **facts: More to write down: the checkpoint, the configuration, ...
+    """
+    data = {**report.as_dict(), **facts, "versions": versions(), "machine": machine()}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
+
+
+def versions() -> dict[str, str]:
+    """Returns the versions of what the figures depend on."""
+    names = ("ir-maniskill", "mani-skill", "sapien", "torch", "gymnasium", "numpy")
+    found = {name: metadata.version(name) for name in names}
+    return {"python": platform.python_version(), **found}
+
+
+def machine() -> dict[str, Any]:
+    """Returns what the figures were made on."""
+    cuda = torch.cuda.get_device_name(0) if torch.cuda.is_available() else None
+    return {"platform": platform.platform(), "cpus": os.cpu_count(), "cuda": cuda}
+
+
+def _check_episodes(episodes: int, least: int = 1) -> None:
+    if episodes < least:
+        raise ValueError(
+            f"episodes: got {episodes}, expected at least {least}, "
+            "one for each instruction"
+        )
+
+
+def _choose_instructions(
+    sentences: Sequence[str], wanted: Sequence[int] | None, episodes: int
+) -> tuple[int, ...]:
+    """Returns the indices of the instructions to evaluate, all checked."""
+    everything = range(len(sentences))
+    chosen = tuple(everything if wanted is None else wanted)
+    if not chosen or any(index not in everything for index in chosen):
+        listed = ", ".join(f"{i}: {s!r}" for i, s in enumerate(sentences))
+        raise ValueError(f"instructions: got {chosen}, available: {listed}")
+    _check_episodes(episodes, len(chosen))
+    return chosen
+
+
+@torch.inference_mode()
+def _play(
+    policy: Policy,
+    envs: VectorEnv,
+    told: Tensor,  # [E]
+    seed: int,
+    stack: StateStack,
+    progress: bool,
+) -> _Record:
+    """Plays all episodes, N at a time; episode e is told instruction told[e]."""
+    episodes, n = len(told), envs.num_envs
+    record = _Record(episodes)
+    for first in tqdm(
+        range(0, episodes, n), "evaluate", disable=not progress, leave=False
+    ):
+        episode = torch.arange(first, first + n)  # [N]
+        options = pinned(told[episode % episodes].to(envs.device))
+        obs, _ = envs.reset(seed=seed + first, options=options)
+        state = stack.reset(obs)
+        playing = episode < episodes  # the last round may have envs to spare
+        while playing.any():
+            action = _act(policy, state, envs.device)
+            obs, reward, terminated, truncated, info = envs.step(action)
+            done = terminated | truncated
+            env = playing.nonzero()[:, 0]
+            record.add(episode[env], env, reward, info.get("final_info", info))
+            playing &= ~done.cpu()
+            state = stack.push(obs, done)
+    return record
+
+
+def pinned(instruction: Tensor | int) -> dict[str, Any]:
+    """Returns reset options for an episode that only its seed and sentence decide.
+
+    PhysX carries contacts and the order of bodies over from one episode to the next,
+    which is enough to end elsewhere; a scene that is built anew remembers nothing.
+    """
+    return {"instruction": instruction, "reconfigure": True}
+
+
+def _act(policy: Policy, state: dict[str, Tensor], device: torch.device) -> Tensor:
+    """Returns the actions [N, 26], on the CPU computed for one env after another.
+
+    How a matrix product is rounded depends on the number of rows, and contacts make
+    much of little: alone, an env is acted on alike whatever others are beside it.
+    """
+    n = len(state["instruction"])
+    if device.type != "cpu":
+        return policy(state)
+    rows = [policy({k: v[i : i + 1] for k, v in state.items()}) for i in range(n)]
+    return torch.cat(rows).to(device)

@@ -1,0 +1,415 @@
+"""Videos: what the robot does, what it sees and feels, and what it was told.
+
+A frame is a dark page of 1280 x 720: the human view on the left, over a timeline of the
+episode; on the right the two pictures that the policy sees, a light for every finger,
+and the counters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import imageio.v2 as imageio
+import numpy as np
+import torch
+from mani_skill.utils.sapien_utils import look_at
+from PIL import Image, ImageDraw, ImageFont
+
+from ir_maniskill.environment.state import StateStack
+from ir_maniskill.training.evaluate import Policy, pinned
+
+Box = tuple[int, int, int, int]
+"""Left, top, width and height [pixel]."""
+Color = tuple[int, int, int]
+
+SIZE = (1280, 720)
+"""Width and height of a frame [pixel]."""
+VIEW: Box = (32, 100, 836, 540)
+"""The human view."""
+TIMELINE: Box = (32, 664, 836, 24)
+"""One cell for each step, below the human view."""
+CAMERAS: tuple[Box, Box] = ((900, 124, 166, 332), (1082, 124, 166, 332))
+"""The policy's top and front pictures."""
+HANDS: Box = (900, 480, 348, 128)
+"""The touch lights."""
+LEGEND = (902, 60)
+"""Where the meaning of the colors is told."""
+COUNTERS: Box = (900, 624, 348, 64)
+"""Step and return."""
+
+PAGE: Color = (18, 20, 24)
+CARD: Color = (28, 31, 37)
+EDGE: Color = (50, 54, 63)
+INK: Color = (238, 240, 244)
+FAINT: Color = (136, 143, 155)
+DIM: Color = (88, 94, 105)
+RIGHT: Color = (64, 210, 128)
+WRONG: Color = (242, 84, 84)
+
+FINGERS = ("Finger 1", "Finger 2", "Thumb")
+"""Fingers of each hand, in the order of the environment."""
+VIEWPOINT = ((0.80, 0.30, 0.40), (0.08, 0.0, 0.09))
+"""Eye and target of the human view [m]."""
+SHARPNESS = 1.5
+"""How much larger the human view is rendered than shown, for smooth edges."""
+STEP_RATE = 20.0
+"""Control steps a second [1/s]."""
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """What one frame shows."""
+
+    view: np.ndarray
+    """Human view [H, W, 3] uint8."""
+    cameras: tuple[np.ndarray, ...]
+    """The policy's pictures, top and front, each [h, w, 3] uint8."""
+    instruction: str
+    """The sentence."""
+    right: tuple[bool, ...]
+    """Which of the six fingers are on the named object."""
+    wrong: tuple[bool, ...]
+    """Which of the six fingers are on another."""
+    step: int
+    """Steps since the episode began."""
+    total_steps: int
+    """Steps of the whole episode."""
+    score: float
+    """Sum of the rewards so far."""
+    history: tuple[tuple[bool, bool], ...]
+    """For each step so far: whether the named object was touched, and another."""
+
+
+def record(
+    policy: Policy,
+    env_id: str,
+    *,
+    episodes: int = 3,
+    seed: int = 0,
+    frames: int = 3,
+    env_kwargs: dict[str, Any] | None = None,
+    instructions: Sequence[int] | None = None,
+) -> Iterator[Snapshot]:
+    """Plays episodes and yields every step; instructions take turns.
+
+    Args:
+        policy: Acts without noise on the state s_t.
+        env_id: The task.
+        episodes: How many.
+        seed: Seed of the first; episode e has seed + e, as in an evaluation.
+        frames: S, observations stacked into a state.
+        env_kwargs: Keyword arguments for `gym.make`.
+        instructions: Which of the experiment's instructions; None: all.
+    """
+    env = gym.make(env_id, num_envs=1, **(env_kwargs or {}))
+    stage = _Stage(env_id)
+    try:
+        base: Any = env.unwrapped
+        told = tuple(instructions or range(len(base.experiment.sentences)))
+        for episode in range(episodes):
+            options = pinned(told[episode % len(told)])
+            obs, _ = env.reset(seed=seed + episode, options=options)
+            yield from _play(policy, env, obs, StateStack(frames), stage)
+    finally:
+        stage.close()
+        env.close()
+
+
+class _Stage:
+    """A second scene, in which the first is shown with shadows, large and sharp.
+
+    Lights are a scene's, not a camera's: shadows in the policy's own scene would change
+    what it sees.
+    """
+
+    def __init__(self, env_id: str) -> None:
+        camera = {
+            "width": round(VIEW[2] * SHARPNESS),
+            "height": round(VIEW[3] * SHARPNESS),
+            "pose": look_at(*VIEWPOINT),
+            "fov": 0.58,
+        }
+        self._env = gym.make(
+            env_id,
+            num_envs=1,
+            obs_mode="none",
+            render_mode="rgb_array",
+            enable_shadow=True,
+            human_render_camera_configs=camera,
+        )
+        self._env.reset(seed=0)
+
+    def show(self, state: dict[str, Any]) -> np.ndarray:
+        """Returns the human view [H, W, 3] uint8 of a state of the other scene."""
+        base: Any = self._env.unwrapped
+        base.set_state_dict(state)
+        return _picture(self._env.render())
+
+    def close(self) -> None:
+        self._env.close()
+
+
+@torch.inference_mode()
+def _play(
+    policy: Policy, env: gym.Env, obs: Any, stack: StateStack, stage: _Stage
+) -> Iterator[Snapshot]:
+    """Plays the episode that a reset has begun."""
+    base: Any = env.unwrapped
+    state, total = stack.reset(obs), base.experiment.episode_steps
+    right = wrong = (False,) * (2 * len(FINGERS))
+    score, history = 0.0, ()
+    for step in range(total + 1):
+        yield Snapshot(
+            view=stage.show(base.get_state_dict()),
+            cameras=_camera_pictures(obs),
+            instruction=base.get_language_instruction()[0],
+            right=right,
+            wrong=wrong,
+            step=step,
+            total_steps=total,
+            score=score,
+            history=history,
+        )
+        if step < total:
+            obs, reward, _, _, info = env.step(policy(state))
+            state, score = stack.push(obs), score + float(reward)
+            right, wrong = _touching(info["contact"][0], int(base.target_index[0]))
+            history += ((any(right), any(wrong)),)
+
+
+def _touching(
+    contact: torch.Tensor, target: int
+) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
+    """Splits contacts [F, C] into fingers on the named object and on another."""
+    right = contact[:, target]
+    others = contact.clone()
+    others[:, target] = False
+    return tuple(right.tolist()), tuple(others.any(dim=1).tolist())
+
+
+def _picture(tensor: Any) -> np.ndarray:
+    """Returns a rendered batch of one as an image [H, W, 3] uint8."""
+    array = torch.as_tensor(tensor).cpu().numpy()
+    return array[0] if array.ndim == 4 else array
+
+
+def _camera_pictures(obs: dict[str, Any]) -> tuple[np.ndarray, ...]:
+    sensors = obs.get("sensor_data", {})
+    names = ("top_camera", "front_camera")
+    return tuple(_picture(sensors[name]["rgb"]) for name in names if name in sensors)
+
+
+# -- Drawing -------------------------------------------------------------------------
+
+
+def draw(snapshot: Snapshot) -> np.ndarray:
+    """Draws a frame [720, 1280, 3] uint8."""
+    page = _page().copy()
+    _paste(page, snapshot.view, VIEW, radius=14)
+    for picture, box in zip(snapshot.cameras, CAMERAS, strict=False):
+        _paste(page, picture, box, radius=10)
+    canvas = ImageDraw.Draw(page)
+    canvas.text((32, 46), snapshot.instruction, INK, _font(34))
+    _label_cameras(canvas, snapshot.cameras)
+    _draw_timeline(canvas, snapshot)
+    _draw_hands(page, snapshot)
+    _draw_counters(canvas, snapshot)
+    return np.asarray(page)
+
+
+@cache
+def _font(size: int) -> Any:
+    return ImageFont.load_default(size)
+
+
+@cache
+def _page() -> Image.Image:
+    """What is the same in every frame."""
+    page = Image.new("RGB", SIZE, PAGE)
+    canvas = ImageDraw.Draw(page)
+    canvas.text((33, 24), "INSTRUCTION", FAINT, _font(13))
+    for box in (HANDS, COUNTERS):
+        _paste_shape(page, box, CARD, radius=10)
+    x, y = LEGEND
+    for color, text in ((RIGHT, "touches the named object"), (WRONG, "another one")):
+        _paste_shape(page, (x, y, 12, 12), color, radius=6)
+        canvas.text((x + 20, y + 6), text, FAINT, _font(13), anchor="lm")
+        x += 212
+    return page
+
+
+def _label_cameras(canvas: ImageDraw.ImageDraw, pictures: Sequence[np.ndarray]) -> None:
+    names = ("TOP CAMERA", "FRONT CAMERA")
+    for name, picture, (x, y, width, _) in zip(names, pictures, CAMERAS, strict=False):
+        height_px, width_px = picture.shape[:2]
+        canvas.text((x + 1, y - 10), name, FAINT, _font(12), anchor="ls")
+        size = f"{width_px} x {height_px}"
+        canvas.text((x + width, y - 10), size, DIM, _font(12), anchor="rs")
+
+
+def _mask(width: int, height: int, radius: int) -> Image.Image:
+    """A rounded rectangle, drawn large and shrunk for smooth corners."""
+    large = Image.new("L", (4 * width, 4 * height))
+    area = (0, 0, 4 * width - 1, 4 * height - 1)
+    ImageDraw.Draw(large).rounded_rectangle(area, 4 * radius, 255)
+    return large.resize((width, height), Image.Resampling.LANCZOS)
+
+
+_cached_mask = cache(_mask)
+
+
+def _paste(page: Image.Image, array: np.ndarray, box: Box, radius: int) -> None:
+    """Pastes a picture into a box, cropped to the box's shape."""
+    x, y, width, height = box
+    picture = Image.fromarray(np.ascontiguousarray(array))
+    if picture.size != (width, height):
+        scale = max(width / picture.width, height / picture.height)
+        small = scale > 1  # what a policy sees stays as coarse as it is
+        method = Image.Resampling.NEAREST if small else Image.Resampling.LANCZOS
+        size = (round(picture.width * scale), round(picture.height * scale))
+        picture = picture.resize(size, method)
+        left, top = (size[0] - width) // 2, (size[1] - height) // 2
+        picture = picture.crop((left, top, left + width, top + height))
+    page.paste(picture, (x, y), _cached_mask(width, height, radius))
+
+
+def _paste_shape(page: Image.Image, box: Box, color: Color, radius: int) -> None:
+    x, y, width, height = box
+    page.paste(
+        color, (x, y, x + width, y + height), _cached_mask(width, height, radius)
+    )
+
+
+def _draw_timeline(canvas: ImageDraw.ImageDraw, snapshot: Snapshot) -> None:
+    """One cell a step: green above if right, red below if wrong, else grey."""
+    x, y, width, height = TIMELINE
+    total = snapshot.total_steps
+    gap = 3 if total <= 100 else 0
+    cell = (width + gap) / total
+    for step in range(total):
+        left, end = round(x + step * cell), round(x + (step + 1) * cell) - gap - 1
+        upper = lower = CARD
+        if step < len(snapshot.history):
+            right, wrong = snapshot.history[step]
+            upper = RIGHT if right else WRONG if wrong else EDGE
+            lower = WRONG if wrong else upper
+        middle = y + height // 2
+        canvas.rectangle((left, y, end, middle), upper)
+        canvas.rectangle((left, middle, end, y + height - 1), lower)
+
+
+def _draw_hands(page: Image.Image, snapshot: Snapshot) -> None:
+    """A row of lights for each hand; the robot's left hand first."""
+    x, y, _, _ = HANDS
+    canvas = ImageDraw.Draw(page)
+    for hand, title in enumerate(("LEFT", "RIGHT")):
+        top = y + 14 + 56 * hand
+        canvas.text((x + 18, top + 14), title, FAINT, _font(13))
+        for finger, name in enumerate(FINGERS):
+            index, left = 3 * hand + finger, x + 84 + 88 * finger
+            color = EDGE
+            if snapshot.right[index]:
+                color = RIGHT
+            if snapshot.wrong[index]:
+                color = WRONG
+            if color != EDGE:
+                glow = tuple((c + 2 * d) // 3 for c, d in zip(color, CARD, strict=True))
+                _paste_shape(page, (left + 14, top - 5, 32, 32), glow, 16)
+            _paste_shape(page, (left + 20, top + 1, 20, 20), color, 10)
+            ink = INK if color != EDGE else FAINT
+            canvas.text((left + 30, top + 29), name, ink, _font(12), anchor="mt")
+
+
+def _draw_counters(canvas: ImageDraw.ImageDraw, snapshot: Snapshot) -> None:
+    x, y, width, _ = COUNTERS
+    seconds = snapshot.step / STEP_RATE
+    columns = (
+        ("STEP", f"{snapshot.step} / {snapshot.total_steps}"),
+        ("TIME", f"{seconds:.2f} s"),
+        ("RETURN", f"{snapshot.score:.1f}"),
+    )
+    for index, (title, value) in enumerate(columns):
+        left = x + 18 + index * width // 3
+        canvas.text((left, y + 12), title, FAINT, _font(12))
+        canvas.text((left, y + 30), value, INK, _font(20))
+
+
+# -- Files ---------------------------------------------------------------------------
+
+
+def write_video(
+    path: Path, snapshots: Iterable[Snapshot], *, speed: float = 0.5, hold: float = 1.0
+) -> int:
+    """Draws snapshots into an mp4, or into a small GIF if the name ends so.
+
+    Args:
+        path: The file.
+        snapshots: What to show, from `record`.
+        speed: 1 is real time.
+        hold: How long the last frame of an episode stays [s].
+
+    Returns:
+        The number of snapshots shown.
+
+    Raises:
+        ValueError: The name ends in neither .mp4 nor .gif, or there is nothing to show.
+    """
+    writers = {".mp4": _write_mp4, ".gif": _write_gif}
+    if path.suffix not in writers:
+        raise ValueError(f"video: got {path}, expected a name ending in .mp4 or .gif")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rate = STEP_RATE * speed
+    count = 0
+
+    def frames() -> Iterator[np.ndarray]:
+        nonlocal count
+        for snapshot in snapshots:
+            frame, last = draw(snapshot), snapshot.step == snapshot.total_steps
+            count += 1
+            yield from [frame] * (1 + round(hold * rate) * last)
+
+    writers[path.suffix](path, frames(), rate)
+    if count == 0:
+        raise ValueError(
+            f"video: got no frames for {path}, expected at least one episode"
+        )
+    return count
+
+
+def _write_mp4(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
+    """H.264 with 4:2:0 colors, which every player knows."""
+    options = {"codec": "libx264", "pixelformat": "yuv420p", "quality": None}
+    tuning = ["-crf", "20", "-preset", "medium", "-movflags", "+faststart"]
+    with imageio.get_writer(
+        path, format="FFMPEG", fps=rate, output_params=tuning, **options
+    ) as writer:
+        for frame in frames:
+            writer.append_data(frame)
+
+
+def _write_gif(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
+    """Half the size, and one palette for all frames, to stay small."""
+    size = (SIZE[0] // 2, SIZE[1] // 2)
+    images = [
+        Image.fromarray(frame).resize(size, Image.Resampling.LANCZOS)
+        for frame in frames
+    ]
+    if not images:
+        return
+    palette = images[len(images) // 2].quantize(128)
+    images = [
+        image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images
+    ]
+    images[0].save(
+        path,
+        save_all=True,
+        append_images=images[1:],
+        duration=round(1000 / rate),
+        loop=0,
+        optimize=True,
+    )
