@@ -62,7 +62,9 @@ class Rate:
         n, p, z = self.total, self.value, Z_95
         center = (p + z * z / (2 * n)) / (1 + z * z / n)
         half = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n)) / (1 + z * z / n)
-        return max(0.0, center - half), min(1.0, center + half)
+        # At the ends the formula is exactly 0 or 1, were it not for rounding.
+        low = center - half if self.count > 0 else 0.0
+        return low, center + half if self.count < n else 1.0
 
     def __str__(self) -> str:
         low, high = self.interval

@@ -1,0 +1,60 @@
+"""Shared fixtures. Simulated envs are dear, and a process can make only some 25."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium as gym
+import pytest
+import torch
+
+import ir_maniskill
+from ir_maniskill.environment.process_vector import ProcessVectorEnv
+
+SMALL = {"width": 32, "height": 64}
+"""Camera size of the tests [pixel]."""
+ENV_KWARGS = {
+    "obs_mode": "rgb",
+    "control_mode": "pd_joint_target_delta_pos",
+    "sensor_configs": SMALL,
+}
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Leave tests marked `gpu` out where torch sees no CUDA device."""
+    if not torch.cuda.is_available():
+        for item in items:
+            if item.get_closest_marker("gpu"):
+                item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
+
+
+@pytest.fixture(scope="session")
+def multi_env() -> Iterator[gym.Env]:
+    """One NaoTouchCubeMulti-v1 with small pictures; reset it before use."""
+    env = gym.make("NaoTouchCubeMulti-v1", num_envs=1, **ENV_KWARGS)
+    yield env
+    env.close()
+
+
+@pytest.fixture(scope="session")
+def multi_vec() -> Iterator[ProcessVectorEnv]:
+    """Two NaoTouchCubeMulti-v1 in two processes; reset them before use."""
+    envs = ir_maniskill.make_vec(
+        "NaoTouchCubeMulti-v1", 2, num_workers=2, sim_backend="physx_cpu", **ENV_KWARGS
+    )
+    yield envs
+    envs.close()
+
+
+@pytest.fixture(scope="session")
+def reflex() -> Any:
+    """A fixed policy that depends on every sense, and moves the arms a lot."""
+    generator = torch.Generator().manual_seed(1)
+    weights = 0.6 * torch.randn(2 * 78 + 18, 26, generator=generator)
+
+    def policy(state: dict[str, torch.Tensor]) -> torch.Tensor:
+        body = ("proprioception", "target", "touch")
+        felt = torch.cat([state[key].flatten(1) for key in body], dim=1)  # [N, 174]
+        seen = state["images"].float().mean(dim=(1, 2, 3, 4, 5)) / 255  # [N]
+        return torch.tanh(felt @ weights + seen[:, None])
+
+    return policy

@@ -1,0 +1,222 @@
+import json
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from ir_maniskill.training import evaluate
+from ir_maniskill.training.evaluate import Rate, evaluate_policy
+
+STEPS = 4
+SENTENCES = ("Touch the blue cube.", "Touch the red cube.")
+
+
+class ScriptedEnvs:
+    """Stands in for a vector env: what happens follows from (seed, instruction).
+
+    Instruction 0 is touched from step 2 on by seed % 3 fingers, and a wrong object by
+    one finger in step 1 if the seed is odd. Instruction 1 is never touched.
+    """
+
+    device = torch.device("cpu")
+    experiment = SimpleNamespace(sentences=SENTENCES)
+
+    def __init__(self, num_envs):
+        self.num_envs, self.resets, self.closed = num_envs, [], False
+
+    def reset(self, *, seed=None, options=None):
+        self.seed = torch.arange(seed, seed + self.num_envs)
+        self.told = options["instruction"]
+        self.resets.append((seed, self.told.tolist()))
+        self.t = 0
+        self.once = torch.zeros(self.num_envs, dtype=torch.bool)
+        self.wrong_once = torch.zeros(self.num_envs, dtype=torch.bool)
+        return self._observe(), {}
+
+    def step(self, action):
+        assert action.shape == (self.num_envs, 26)
+        self.t += 1
+        right = (self.seed % 3) * (self.told == 0) * (self.t >= 2)
+        wrong = (self.seed % 2) * (self.t == 1)
+        self.once |= right > 0
+        self.wrong_once |= wrong > 0
+        info = {
+            "right_fingers": right,
+            "wrong_fingers": wrong,
+            "success_once": self.once.clone(),
+            "exclusive_success": self.once & ~self.wrong_once,
+        }
+        done = torch.full((self.num_envs,), self.t == STEPS)
+        if done.all():
+            # The new episode, begun in the same step, has touched nothing yet.
+            fresh = {key: torch.zeros_like(value) for key, value in info.items()}
+            info = {**fresh, "final_info": info, "_final_info": done}
+        return self._observe(), (right > 0).float(), torch.zeros_like(done), done, info
+
+    def _observe(self):
+        n = self.num_envs
+        return {
+            "agent": {
+                "proprioception": torch.zeros(n, 26),
+                "target": torch.zeros(n, 26),
+            },
+            "extra": {
+                "touch": torch.zeros(n, 6),
+                "instruction": self.told[:, None],
+            },
+        }
+
+    def close(self):
+        self.closed = True
+
+
+def still(state):
+    return torch.zeros(len(state["instruction"]), 26)
+
+
+def scripted(num_envs, episodes=12, **kwargs):
+    envs = ScriptedEnvs(num_envs)
+    report = evaluate_policy(
+        still, "Scripted-v1", episodes=episodes, seed=0, envs=envs, **kwargs
+    )
+    return report, envs
+
+
+def test_wilson_interval_matches_hand_computed_values():
+    # 8 of 10: center (0.8 + z^2/20) / (1 + z^2/10) with z = 1.96.
+    low, high = Rate(8, 10).interval
+    assert low == pytest.approx(0.4902, abs=1e-4)
+    assert high == pytest.approx(0.9433, abs=1e-4)
+
+
+def test_wilson_interval_stays_within_zero_and_one_and_is_never_empty():
+    assert Rate(0, 20).interval[0] == 0 and Rate(0, 20).interval[1] > 0.1
+    assert Rate(20, 20).interval[1] == 1 and Rate(20, 20).interval[0] < 0.9
+
+
+@pytest.mark.parametrize("count, total", [(1, 0), (-1, 3), (4, 3)])
+def test_impossible_rates_are_refused(count, total):
+    with pytest.raises(ValueError, match="expected"):
+        Rate(count, total)
+
+
+def test_scores_are_those_worked_out_by_hand():
+    report, _ = scripted(num_envs=4)
+    # Even seeds 0, 2, ... 10 are told to touch blue; 0 and 6 touch with no finger,
+    # 2 and 8 with two, 4 and 10 with one, in 3 of 4 steps. None errs: they are even.
+    blue = report.instructions[SENTENCES[0]]
+    assert (blue.success.count, blue.success.total) == (4, 6)
+    assert blue.exclusive.count == 4
+    assert blue.touching == pytest.approx(4 / 6 * 3 / 4)
+    assert blue.right_fingers == pytest.approx((2 + 2 + 1 + 1) * 3 / (6 * 4))
+    assert blue.wrong_fingers == 0
+    assert blue.mean_return == pytest.approx(4 * 3 / 6)
+    # Odd seeds touch a wrong object once, and red never.
+    red = report.instructions[SENTENCES[1]]
+    assert (red.success.count, red.touching) == (0, 0)
+    assert red.wrong_fingers == pytest.approx(1 / 4)
+    assert report.overall.success.value == pytest.approx(4 / 12)
+
+
+def test_touching_a_wrong_object_first_is_no_exclusive_success():
+    report, _ = scripted(num_envs=3, episodes=12, instructions=[0])
+    # All 12 seeds are told blue; 0, 3, 6, 9 never touch; of the rest the odd ones err.
+    assert report.overall.success.count == 8
+    assert report.overall.exclusive.count == 4
+
+
+@pytest.mark.parametrize("num_envs", [1, 3, 5, 7, 12, 16])
+def test_scores_do_not_depend_on_the_number_of_envs(num_envs):
+    expected, _ = scripted(num_envs=4)
+    assert scripted(num_envs)[0] == expected
+
+
+def test_episodes_have_pinned_seeds_and_instructions_in_turn():
+    _, envs = scripted(num_envs=4, episodes=6)
+    assert envs.resets == [(0, [0, 1, 0, 1]), (4, [0, 1, 0, 1])]
+
+
+def test_envs_that_are_given_stay_open():
+    _, envs = scripted(num_envs=2)
+    assert not envs.closed
+
+
+@pytest.mark.parametrize(
+    "kwargs, message",
+    [
+        ({"episodes": 1}, "got 1, expected at least 2"),
+        ({"episodes": 0}, "expected at least"),
+        (
+            {"episodes": 4, "instructions": [2]},
+            "got .2,., available: 0: 'Touch the blue",
+        ),
+        ({"episodes": 4, "instructions": []}, "available"),
+    ],
+)
+def test_impossible_requests_are_refused(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        scripted(num_envs=2, **kwargs)
+
+
+def test_the_policy_is_asked_about_one_env_at_a_time_on_a_cpu():
+    sizes = []
+
+    def policy(state):
+        sizes.append(len(state["instruction"]))
+        return still(state)
+
+    evaluate_policy(
+        policy, "S-v1", episodes=3, seed=0, envs=ScriptedEnvs(3), instructions=[0]
+    )
+    assert set(sizes) == {1} and len(sizes) == 3 * STEPS
+
+
+def test_report_is_written_as_json_with_versions_and_machine(tmp_path):
+    report, _ = scripted(num_envs=4)
+    path = tmp_path / "deep" / "report.json"
+    evaluate.write_report(path, report, checkpoint="best.safetensors")
+    data = json.loads(path.read_text())
+    assert data["overall"]["success"] == pytest.approx(4 / 12)
+    assert data["instructions"][SENTENCES[1]]["success_interval"][0] == 0
+    assert data["seed"] == 0 and data["checkpoint"] == "best.safetensors"
+    assert data["versions"]["sapien"].startswith("3.") and data["machine"]["cpus"] >= 1
+
+
+def test_table_has_a_row_for_each_instruction_and_one_for_all():
+    report, _ = scripted(num_envs=4)
+    lines = str(report).splitlines()
+    assert [line.split()[0] for line in lines] == [
+        "instruction",
+        "Touch",
+        "Touch",
+        "all",
+    ]
+    assert " 66.7% " in lines[1] and all(
+        math.isclose(len(x), 112, abs_tol=12) for x in lines
+    )
+
+
+@pytest.mark.render
+def test_real_scores_are_equal_in_any_order_and_company(multi_vec, reflex):
+    """The same episodes, two at a time, after others or not, end exactly alike."""
+
+    def run(seed, episodes):
+        return evaluate_policy(
+            reflex,
+            "NaoTouchCubeMulti-v1",
+            episodes=episodes,
+            seed=seed,
+            envs=multi_vec,
+            instructions=[1],
+        )
+
+    whole = run(seed=20, episodes=4)
+    later = run(seed=22, episodes=2)
+    first = run(seed=20, episodes=2)
+    again = run(seed=20, episodes=4)
+    assert whole == again
+    for name in ("right_fingers", "wrong_fingers", "mean_return"):
+        halves = [getattr(part.overall, name) for part in (first, later)]
+        assert sum(halves) / 2 == pytest.approx(getattr(whole.overall, name))
+    assert whole.overall.right_fingers + whole.overall.wrong_fingers > 0
