@@ -132,6 +132,7 @@ class StateEncoder(nn.Module):
     @staticmethod
     def _body_keys(config: AgentConfig, senses: tuple[str, ...]) -> tuple[str, ...]:
         """Return the entries of the state that the body senses consist of."""
+        keys: dict[str, tuple[str, ...]]
         keys = {"state": ("privileged",), "touch": ("touch",)}
         felt = (
             ("proprioception", "target") if config.sees_target else ("proprioception",)
@@ -209,7 +210,7 @@ class Agent(nn.Module):
         log_prob = policy.log_prob(action).sum(-1)
         return Act(action, log_prob, self._value(state, aligned))
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def policy(self, state: State) -> Tensor:
         """Return the policy's mean action [N,A] in [-1,1], without any noise."""
         needed = ["tokens", "frames", "joints", "fingers"]

@@ -23,7 +23,8 @@ class PaperVision(nn.Module):
     def __init__(self, frames: int, cameras: int, features: int) -> None:
         """Make the net for `frames` stacked images of `cameras` cameras."""
         super().__init__()
-        maps = [((side - 4) // 2 - 4) // 2 for side in (128, 64 * cameras)]
+        sides = (self.height, self.width * cameras)
+        maps = [((side - 4) // 2 - 4) // 2 for side in sides]  # [pixel] after pooling
         self.maps = nn.Sequential(
             *(nn.Conv2d(3 * frames, 12, 5), nn.ReLU(), nn.MaxPool2d(2)),
             *(nn.Conv2d(12, 12, 5), nn.ReLU(), nn.MaxPool2d(2)),
@@ -36,10 +37,9 @@ class PaperVision(nn.Module):
     def forward(self, images: Tensor, language: Tensor) -> Tensor:
         """Return V_t [N,D] of images [N,S,K,H,W,3]; the sentence plays no part."""
         del language
-        count, _, cameras, height, width, _ = images.shape
-        joined = images.permute(0, 3, 2, 4, 1, 5)  # [N,H,K,W,S,3]
-        joined = pixels(joined.reshape(count, height, cameras * width, -1))
-        size = (self.height, self.width * cameras)
+        wide = [torch.cat(frame.unbind(1), dim=2) for frame in images.unbind(1)]
+        joined = pixels(torch.cat(wide, dim=-1))  # [N,3S,H,K*W]
+        size = (self.height, self.width * images.shape[2])
         if joined.shape[-2:] != size:
             joined = functional.interpolate(joined, size, mode="area")
         return self.embedding(self.maps(joined).flatten(1))
@@ -64,7 +64,7 @@ class CameraVision(nn.Module):
 
     def forward(self, images: Tensor, language: Tensor) -> Tensor:
         """Return the flat maps [N,D] of this camera's images [N,S,H,W,3]."""
-        maps = pixels(images.permute(0, 2, 3, 1, 4).flatten(3))  # [N,3S,H,W]
+        maps = pixels(torch.cat(images.unbind(1), dim=-1))  # [N,3S,H,W]
         for convolve, film in zip(self.convolutions, self.films, strict=True):
             maps = convolve(maps)
             if isinstance(film, FiLM):

@@ -106,7 +106,7 @@ def read(path: Path) -> Stored:
         MemoryError,
     ) as error:
         raise CheckpointError(
-            f"{path}: got a file that is cut short, altered or not ours ({error}); "
+            f"{path}: got a file that is cut short, altered or not ours ({_brief(error)}); "
             f"expected {CHECKPOINT!r} or {POLICY!r}: restore it, or train anew"
         ) from error
 
@@ -124,7 +124,7 @@ def _digest(tensors: Mapping[str, Tensor], text: str) -> str:
     for name in sorted(tensors):
         tensor = tensors[name]
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
-        digest.update(tensor.reshape(-1).view(torch.uint8).numpy())
+        digest.update(tensor.reshape(-1).view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()
 
 
@@ -197,11 +197,17 @@ def load_policy(path: Path | str) -> tuple[Agent, TrainConfig, dict[str, Any]]:
         )
     except (ConfigError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise CheckpointError(
-            f"{path}: its weights and its config do not belong together ({error}); "
+            f"{path}: its weights and its config do not belong together ({_brief(error)}); "
             "expected a file written by this version of ir_maniskill"
         ) from error
     agent.eval()
     return agent, config, stored.metadata
+
+
+def _brief(error: Exception) -> str:
+    """Return the message in one line of bearable length."""
+    line = " ".join(str(error).split())
+    return line if len(line) < 300 else line[:300] + "..."
 
 
 def _under(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

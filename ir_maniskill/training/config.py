@@ -12,6 +12,9 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
 Sense = Literal["vision", "proprioception", "touch", "state"]
+Vision = Literal["strided", "paper"]
+CriticInput = Literal["asymmetric", "separate", "shared"]
+StdMode = Literal["annealed", "fixed", "learned"]
 
 Config = TypeVar("Config")
 
@@ -47,7 +50,7 @@ class AgentConfig:
     """Attention heads a layer."""
     language_width: int = 50
     """Units of each token's representation."""
-    vision: Literal["strided", "paper"] = "strided"
+    vision: Vision = "strided"
     """"paper": two 5x5 convolutions over the cameras side by side; "strided": three
     stride-2 convolutions for each camera."""
     vision_channels: tuple[int, ...] = (16, 32, 32)
@@ -60,10 +63,10 @@ class AgentConfig:
     """Units of H_t."""
     hidden: tuple[int, ...] = (500, 256, 128)
     """Units of the actor's and the critic's tanh layers."""
-    critic: Literal["asymmetric", "separate", "shared"] = "asymmetric"
+    critic: CriticInput = "asymmetric"
     """What the critic reads: the simulator's state instead of images, its own encoder
     of the actor's senses, or the actor's B_t."""
-    std_mode: Literal["annealed", "fixed", "learned"] = "annealed"
+    std_mode: StdMode = "annealed"
     """How the standard deviation of the action noise evolves."""
     std: float = 0.5
     """Standard deviation of the action noise at the start."""
@@ -77,11 +80,9 @@ class AgentConfig:
         for sense in self.senses or ():
             _require_choice("senses", sense, Sense)
         _require(self.senses != (), "senses", self.senses, "at least one, or None")
-        _require_choice("vision", self.vision, Literal["strided", "paper"])
-        modes = Literal["asymmetric", "separate", "shared"]
-        _require_choice("critic", self.critic, modes)
-        modes = Literal["annealed", "fixed", "learned"]
-        _require_choice("std_mode", self.std_mode, modes)
+        _require_choice("vision", self.vision, Vision)
+        _require_choice("critic", self.critic, CriticInput)
+        _require_choice("std_mode", self.std_mode, StdMode)
         for name in ("vocabulary", "language_layers", "language_heads"):
             _require(getattr(self, name) > 0, name, getattr(self, name), "at least 1")
         width, heads = self.language_width, self.language_heads
@@ -198,9 +199,9 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
-        positive = ("total_steps", "num_envs", "camera_height", "camera_width")
-        positive += ("frames", "eval_interval", "eval_episodes", "checkpoint_interval")
-        for name in positive:
+        positive = "total_steps num_envs camera_height camera_width frames "
+        positive += "eval_interval eval_episodes checkpoint_interval"
+        for name in positive.split():
             _require(getattr(self, name) > 0, name, getattr(self, name), "at least 1")
         for name in ("num_workers", "threads"):
             value = getattr(self, name)

@@ -4,12 +4,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from gymnasium.vector import VectorEnv
 from torch import Tensor
 
 from ir_maniskill.agent.agent import Act, Agent, State
+from ir_maniskill.environment.vector import GpuVectorEnv, ProcessVectorEnv
 from ir_maniskill.training.config import PPOConfig
 from ir_maniskill.training.finite import check_finite
+
+VectorEnv = GpuVectorEnv | ProcessVectorEnv
 
 
 @dataclass
@@ -249,7 +251,7 @@ def to(state: State, device: torch.device) -> State:
     return {key: value.to(device) for key, value in state.items()}
 
 
-@torch.inference_mode()
+@torch.no_grad()
 def collect(
     envs: VectorEnv,
     stack: Any,

@@ -1,5 +1,6 @@
 """The training loop: collect, improve, evaluate, keep."""
 
+import contextlib
 import dataclasses
 import json
 import logging
@@ -10,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from gymnasium.vector import VectorEnv
 from tqdm import tqdm
 
 from ir_maniskill.agent.agent import Agent, State, StateSpec
@@ -20,7 +20,7 @@ from ir_maniskill.training import checkpoint, ppo
 from ir_maniskill.training.checkpoint import CheckpointError, Stored
 from ir_maniskill.training.config import TrainConfig, decode
 from ir_maniskill.training.evaluate import EvaluationReport, evaluate_policy
-from ir_maniskill.training.rollout import RewardScale, Rollout, collect, to
+from ir_maniskill.training.rollout import RewardScale, Rollout, VectorEnv, collect, to
 from ir_maniskill.training.run_folder import RunFolder
 
 log = logging.getLogger(__name__)
@@ -35,7 +35,9 @@ FINAL_EPISODES = 100
 """Episodes of the last evaluation, of the policy that is kept."""
 
 
-def train(config: TrainConfig, resume: bool = False, envs: VectorEnv = None) -> Path:
+def train(
+    config: TrainConfig, resume: bool = False, envs: VectorEnv | None = None
+) -> Path:
     """Train an agent and return the file of its best policy.
 
     Ctrl-C keeps a checkpoint of the last complete update and leaves.
@@ -50,16 +52,15 @@ def train(config: TrainConfig, resume: bool = False, envs: VectorEnv = None) -> 
         TrainingDivergedError: if a number stopped being finite.
     """
     folder = RunFolder(Path(config.out), resume=resume)
-    ours = _make_envs(config) if envs is None else None
-    try:
-        trainer = Trainer(config, ours or envs, folder)
+    with contextlib.ExitStack() as leaving:
+        leaving.callback(folder.close)
+        if envs is None:
+            envs = _make_envs(config)
+            leaving.callback(envs.close)
+        trainer = Trainer(config, envs, folder)
         if resume and folder.last.exists():
             trainer.restore()
         trainer.learn()
-    finally:
-        folder.close()
-        if ours is not None:
-            ours.close()
     return folder.best
 
 
@@ -92,7 +93,7 @@ class Trainer:
         self.steps, self.best_score = 0, -math.inf
         self.reward_scale = RewardScale(config.num_envs, config.ppo.gamma)
         self.state = self._fresh_scenes()
-        actions = envs.single_action_space.shape[0]
+        actions = math.prod(envs.single_action_space.shape or ())
         spec = StateSpec.of(self.state, actions)
         self.agent = Agent(config.agent, spec).to(self.device)
         rate = config.ppo.learning_rate
@@ -137,7 +138,7 @@ class Trainer:
             self.rollout.reward = self.reward_scale(
                 self.rollout.reward, self.rollout.done
             )
-        with torch.inference_mode():
+        with torch.no_grad():
             last_value = self.agent.value(self.state)
         self.rollout.finish(last_value, config.ppo.gamma, config.ppo.gae_lambda)
         collected = time.perf_counter()

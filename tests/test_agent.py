@@ -1,0 +1,247 @@
+import dataclasses
+
+import pytest
+import torch
+
+from ir_maniskill.agent import Agent, StateSpec
+from ir_maniskill.agent.actor import Actor
+from ir_maniskill.agent.alignment import FiLM
+from ir_maniskill.agent.critic import Standardize
+from ir_maniskill.agent.language_system import LanguageSystem
+from ir_maniskill.agent.perceptual_system import PaperVision, StridedVision, pixels
+from ir_maniskill.training.config import CONFIGS, AgentConfig
+
+TOKENS, ACTIONS = 5, 26
+
+
+def make_state(n=4, height=64, width=32, privileged=50):
+    generator = torch.Generator().manual_seed(0)
+    state = {
+        "instruction": torch.randint(2, 10, (n, TOKENS), generator=generator),
+        "images": torch.randint(
+            256, (n, 3, 2, height, width, 3), dtype=torch.uint8, generator=generator
+        ),
+        "proprioception": torch.rand(n, 3, 26, generator=generator),
+        "target": torch.rand(n, 3, 26, generator=generator),
+        "touch": torch.ones(n, 3, 6),
+        "privileged": torch.rand(n, privileged, generator=generator),
+        "target_position": torch.rand(n, 3, generator=generator),
+    }
+    state["instruction"][:, -1] = 0
+    return state
+
+
+def make_agent(state, **changes):
+    torch.manual_seed(0)
+    return Agent(AgentConfig(**changes), StateSpec.of(state, ACTIONS))
+
+
+def language(**changes):
+    sizes = {"layers": 3, "heads": 2, "width": 50} | changes
+    return LanguageSystem(10, TOKENS, **sizes)
+
+
+def test_language_of_the_paper_has_five_times_fifty_outputs():
+    assert language()(torch.tensor([[3, 4, 5, 8, 2]])).shape == (1, 250)
+
+
+def test_padding_neither_speaks_nor_is_heard():
+    system = language()
+    short = system(torch.tensor([[3, 4, 5, 0, 0]]))
+    with torch.no_grad():
+        system.positions[3:] += 1.0
+    assert torch.equal(short, system(torch.tensor([[3, 4, 5, 0, 0]])))
+    assert torch.equal(short[:, 150:], torch.zeros(1, 100))
+
+
+def test_the_order_of_words_matters():
+    system = language()
+    first, second = system(torch.tensor([[3, 4, 5, 8, 2], [3, 5, 4, 8, 2]]))
+    assert not torch.allclose(first, second)
+
+
+def test_repeated_sentences_are_encoded_alike_and_share_their_gradient():
+    system = language()
+    batch = torch.tensor([[3, 4, 5, 8, 2], [3, 4, 6, 8, 2], [3, 4, 5, 8, 2]])
+    alone = torch.cat([system._encode(row[None]) for row in batch])
+    assert torch.allclose(system(batch), alone, atol=1e-6)
+    weight = system.layers[0].mix.weight
+    (shared,) = torch.autograd.grad((system(batch) ** 2).sum(), weight)
+    (separate,) = torch.autograd.grad((alone**2).sum(), weight)
+    assert torch.allclose(shared, separate, rtol=1e-3, atol=1e-4)
+
+
+def test_pixels_run_from_minus_one_to_one():
+    images = torch.tensor([0, 255], dtype=torch.uint8).view(1, 1, 2, 1)
+    assert pixels(images).flatten().tolist() == pytest.approx([-1, 1])
+
+
+def test_vision_of_the_paper_flattens_10092_numbers():
+    assert PaperVision(3, 2, 256).embedding[0].in_features == 10092
+
+
+def test_vision_of_the_paper_sets_cameras_side_by_side():
+    vision = PaperVision(3, 2, 256)
+    seen = []
+    vision.maps[0].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    images = torch.zeros(1, 3, 2, 128, 64, 3, dtype=torch.uint8)
+    images[0, 1, 1, 5, 7, 2] = 255  # frame 1, right camera, row 5, column 7, blue
+    vision(images, torch.zeros(1, 0))
+    assert seen[0].shape == (1, 9, 128, 128)
+    assert (seen[0] > 0).nonzero().tolist() == [[0, 5, 5, 64 + 7]]
+
+
+def test_vision_of_the_paper_resizes_what_has_another_size():
+    vision = PaperVision(3, 2, 256)
+    large = torch.zeros(1, 3, 2, 512, 256, 3, dtype=torch.uint8)
+    assert vision(large, torch.zeros(1, 0)).shape == (1, 256)
+
+
+@pytest.mark.parametrize("size", [(64, 32), (33, 17), (8, 8)])
+def test_strided_vision_takes_images_of_any_size(size):
+    vision = StridedVision(3, (2, *size), (16, 32, 32), 64, film_width=0)
+    images = torch.zeros(2, 3, 2, *size, 3, dtype=torch.uint8)
+    assert vision(images, torch.zeros(2, 0)).shape == (2, 64)
+
+
+def test_film_at_first_changes_nothing_and_then_scales_and_shifts():
+    film, maps = FiLM(1, 1), torch.full((1, 1, 2, 2), 3.0)
+    assert torch.equal(film(maps, torch.ones(1, 1)), maps)
+    with torch.no_grad():
+        film.scale_and_shift.bias.copy_(torch.tensor([1.0, 0.5]))
+    assert film(maps, torch.ones(1, 1)).unique().tolist() == [(1 + 1) * 3 + 0.5]
+
+
+def test_film_lets_the_sentence_reach_the_convolutions():
+    state = make_state()
+    agent = make_agent(state, film=True)
+    agent.evaluate_actions(state, torch.ones(4, ACTIONS)).log_prob.sum().backward()
+    grads = [p.grad for n, p in agent.named_parameters() if "films" in n and "wei" in n]
+    assert grads
+    assert all(grad.abs().sum() > 0 for grad in grads)
+
+
+def test_first_actions_are_near_the_middle_with_the_given_deviation():
+    actor = Actor(10, (500, 256, 128), ACTIONS, std=0.36, learn_std=False)
+    policy = actor(torch.randn(64, 10))
+    assert policy.mean.abs().max() < 0.1
+    assert torch.allclose(policy.stddev, torch.tensor(0.36))
+    actor.set_std(0.2)
+    assert torch.allclose(actor(torch.zeros(1, 10)).stddev, torch.tensor(0.2))
+
+
+def test_only_a_learned_deviation_is_a_parameter():
+    state = make_state()
+    names = {m: dict(make_agent(state, std_mode=m).named_parameters()).keys()
+             for m in ("fixed", "annealed", "learned")}  # fmt: skip
+    assert [m for m in names if "actor.log_std" in names[m]] == ["learned"]
+
+
+def test_log_prob_of_an_action_is_that_of_the_gaussian():
+    state = make_state(n=1)
+    agent = make_agent(state, std=0.5)
+    act = agent.act(state, deterministic=True)
+    expected = ACTIONS * -torch.log(torch.tensor(0.5 * (2 * torch.pi) ** 0.5))
+    assert act.log_prob.item() == pytest.approx(float(expected), rel=1e-4)
+
+
+@pytest.mark.parametrize("critic", ["asymmetric", "separate", "shared"])
+@pytest.mark.parametrize("vision", ["strided", "paper"])
+def test_judging_an_action_agrees_with_having_acted(critic, vision):
+    state = make_state()
+    agent = make_agent(state, critic=critic, vision=vision, film=False)
+    act = agent.act(state)
+    now = agent.evaluate_actions(state, act.action)
+    assert torch.allclose(now.log_prob, act.log_prob)
+    assert torch.allclose(now.value, act.value)
+    assert torch.allclose(agent.value(state), act.value, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("senses", "read"),
+    [
+        (("vision",), {"images"}),
+        (("proprioception",), {"proprioception", "target"}),
+        (("touch",), {"touch"}),
+        (("state",), {"privileged"}),
+        (("vision", "touch"), {"images", "touch"}),
+    ],
+)
+def test_the_actor_reads_its_senses_and_no_others(senses, read):
+    state = make_state()
+    agent = make_agent(state, senses=senses)
+    before = agent.act(state, deterministic=True).action
+    for key in set(state) - {"instruction"}:
+        changed = state | {key: state[key].flip(0) // 2}
+        if key == "touch":
+            changed[key] = 1 - state[key]
+        after = agent.act(changed, deterministic=True).action
+        assert (not torch.allclose(before, after)) == (key in read), key
+
+
+def test_the_asymmetric_critic_looks_at_the_state_instead_of_the_images():
+    state = make_state()
+    agent = make_agent(state)
+    value = agent.value(state)
+    assert torch.equal(value, agent.value(state | {"images": state["images"] // 2}))
+    other = state | {"privileged": state["privileged"] + 1}
+    assert not torch.allclose(value, agent.value(other))
+
+
+def test_the_asymmetric_critic_asks_for_the_state():
+    state = {k: v for k, v in make_state().items() if k != "privileged"}
+    with pytest.raises(ValueError, match=r"rgb\+state_dict"):
+        make_agent(state)
+
+
+def test_the_auxiliary_head_exists_only_if_its_loss_counts():
+    state = make_state()
+    action = torch.zeros(4, ACTIONS)
+    with_head = make_agent(state, auxiliary_weight=0.1)
+    assert with_head.evaluate_actions(state, action).target_position.shape == (4, 3)
+    without = make_agent(state)
+    assert without.evaluate_actions(state, action).target_position is None
+
+
+def test_the_policy_is_noiseless_and_within_bounds():
+    state = make_state()
+    agent = make_agent(state)
+    with torch.no_grad():
+        agent.actor.mean[-1].bias.fill_(3.0)
+    assert torch.equal(agent.policy(state), torch.ones(4, ACTIONS))
+
+
+def test_the_policy_refuses_images_of_another_size():
+    agent = make_agent(make_state())
+    with pytest.raises(ValueError, match=r"height of the state: got 32.*made for 64"):
+        agent.policy(make_state(height=32))
+
+
+def test_the_policy_needs_no_privileged_state():
+    state = make_state()
+    agent = make_agent(state)
+    public = {k: v for k, v in state.items() if k not in ("privileged",)}
+    assert torch.equal(agent.policy(public), agent.policy(state))
+
+
+def test_the_papers_agent_shares_nothing_between_actor_and_critic():
+    state = make_state(n=2, height=128, width=64)
+    config = dataclasses.replace(CONFIGS["paper"].agent, senses=("vision",))
+    agent = Agent(config, StateSpec.of(state, ACTIONS))
+    agent.value(state).sum().backward()
+    trained = {
+        n.split(".")[0] for n, p in agent.named_parameters() if p.grad is not None
+    }
+    assert trained == {"critic", "critic_encoder"}
+    assert agent.encoder.width == 250 + 256
+
+
+def test_standardizing_follows_mean_and_variance_of_all_that_was_seen():
+    standardize = Standardize(2)
+    seen = torch.tensor([[0.0, 5.0], [2.0, 5.0], [4.0, 5.0], [6.0, 5.0]])
+    standardize.update(seen[:1])
+    standardize.update(seen[1:])
+    assert standardize.mean.tolist() == pytest.approx([3, 5])
+    assert standardize.variance.tolist() == pytest.approx([5, 0])
+    shown = standardize(torch.tensor([[3 + 5**0.5, 5.0]]))
+    assert shown.flatten().tolist() == pytest.approx([1, 0])

@@ -1,0 +1,258 @@
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+from toy_envs import GOALS, ToyVectorEnv, toy_config
+
+from ir_maniskill.agent import Agent, StateSpec
+from ir_maniskill.agent.agent import Act, Judgement
+from ir_maniskill.environment.state import StateStack
+from ir_maniskill.training import ppo
+from ir_maniskill.training.config import PPOConfig
+from ir_maniskill.training.finite import TrainingDivergedError, check_finite
+from ir_maniskill.training.rollout import (
+    Batch,
+    RewardScale,
+    Rollout,
+    advantages,
+    collect,
+)
+
+
+def column(*values):
+    return torch.tensor(values)[:, None]
+
+
+def test_advantages_by_hand():
+    # gamma 0.5, lambda 0.5; the episode ends after step 1, where the cut-off future
+    # is worth 4; step 2 starts another, whose next state is worth 2.
+    reward, value = column(1.0, 2.0, 3.0), column(1.0, 1.0, 1.0)
+    next_value, done = column(1.0, 4.0, 2.0), column(False, True, False)
+    got = advantages(reward, value, next_value, done, 0.5, 0.5)
+    # deltas: 1 + .5 - 1 = .5;  2 + 2 - 1 = 3;  3 + 1 - 1 = 3
+    assert got.flatten().tolist() == [0.5 + 0.25 * 3, 3.0, 3.0]
+
+
+def test_lambda_one_gives_monte_carlo_returns():
+    reward, value = column(1.0, 1.0, 1.0), column(5.0, -3.0, 2.0)
+    next_value = column(-3.0, 2.0, 0.0)
+    done = column(False, False, True)
+    got = advantages(reward, value, next_value, done, 0.5, 1.0) + value
+    assert got.flatten().tolist() == pytest.approx([1.75, 1.5, 1.0])
+
+
+def test_finish_takes_the_value_of_the_next_state_unless_the_episode_ended():
+    rollout = Rollout(2, tiny_state(1), 1)
+    rollout.value[:] = column(10.0, 20.0)
+    rollout.add_outcome(0, torch.zeros(1), torch.tensor([True]), torch.tensor([7.0]))
+    rollout.add_outcome(1, torch.zeros(1), torch.tensor([False]), torch.zeros(1))
+    rollout.finish(torch.tensor([30.0]), gamma=1.0, gae_lambda=0.0)
+    assert rollout.returns.flatten().tolist() == [7, 30]
+
+
+def tiny_state(n, image=0, frames=3):
+    images = torch.full((n, frames, 1, 1, 1, 3), image, dtype=torch.uint8)
+    return {
+        "instruction": torch.ones(n, 1, dtype=torch.long),
+        "images": images,
+        "proprioception": torch.zeros(n, frames, 1),
+        "target": torch.zeros(n, frames, 1),
+        "touch": torch.zeros(n, frames, 1),
+    }
+
+
+def test_stacks_gathered_from_single_images_equal_the_states_across_resets():
+    generator = torch.Generator().manual_seed(0)
+    n, steps, frames = 3, 12, 3
+
+    def observe():
+        image = torch.randint(256, (n, 2, 1, 3), dtype=torch.uint8, generator=generator)
+        camera = {"rgb": image}
+        empty = torch.zeros(n, 1)
+        return {
+            "agent": {"proprioception": empty, "target": empty},
+            "extra": {"touch": empty, "instruction": torch.ones(n, 1).long()},
+            "sensor_data": {"top_camera": camera, "front_camera": camera},
+        }
+
+    stack = StateStack(frames)
+    state = stack.reset(observe())
+    state = stack.push(observe(), torch.zeros(n, dtype=torch.bool))
+    rollout = Rollout(steps, state, 1)
+    for _ in range(2):  # a second roll-out goes on in the middle of episodes
+        rollout.begin(state)
+        states = []
+        for t in range(steps):
+            states.append(state["images"].clone())
+            act = Act(torch.zeros(n, 1), torch.zeros(n), torch.zeros(n))
+            rollout.add(t, state, act)
+            done = torch.rand(n, generator=generator) < 0.3
+            rollout.add_outcome(t, torch.zeros(n), done, torch.zeros(n))
+            state = stack.push(observe(), done)
+        everything = rollout.batch(torch.arange(steps * n)).state["images"]
+        assert torch.equal(everything, torch.cat(states))
+
+
+def test_each_image_is_stored_once():
+    rollout = Rollout(10, tiny_state(4), 1)
+    assert rollout.frames.images.shape[:2] == (10 + 2, 4)
+
+
+def test_collecting_bootstraps_only_where_time_ran_out():
+    envs, config = ToyVectorEnv(4), PPOConfig()
+    stack = StateStack(3)
+    state = stack.reset(envs.reset(seed=0)[0])
+    agent = Agent(toy_config("x").agent, StateSpec.of(state, 2))
+    rollout = Rollout(10, state, 2)
+    with torch.no_grad():
+        agent.critic.value[-1].weight.zero_()
+        agent.critic.value[-1].bias.fill_(5.0)
+    _, sums = collect(envs, stack, state, agent, rollout, config)
+    assert rollout.done.nonzero()[:, 0].unique().tolist() == [7]
+    assert torch.equal(rollout.next_value[7], torch.full((4,), 5.0))
+    assert (sums.steps, sums.episodes) == (40, 4)
+    state = stack.reset(envs.reset(seed=0)[0])
+    collect(envs, stack, state, agent, rollout, PPOConfig(bootstrap=False))
+    assert torch.equal(rollout.next_value[7], torch.zeros(4))
+
+
+def test_rewards_are_scaled_by_the_deviation_of_discounted_returns():
+    scale = RewardScale(1, gamma=0.5)
+    reward, done = column(2.0, 0.0, 4.0), column(False, True, False)
+    # discounted returns: 2, 1, then anew 4; population variance 14 / 9
+    scaled = scale(reward, done)
+    expected = reward / math.sqrt(14 / 9)
+    assert torch.allclose(scaled, expected)
+    assert scale.running.tolist() == [4.0]
+
+
+def test_no_reward_at_all_stays_no_reward():
+    scaled = RewardScale(2, 0.9)(torch.zeros(4, 2), torch.zeros(4, 2).bool())
+    assert torch.equal(scaled, torch.zeros(4, 2))
+
+
+def test_the_reward_scale_goes_on_after_a_restart():
+    first, done = torch.rand(16, 2), torch.zeros(16, 2, dtype=torch.bool)
+    scale = RewardScale(2, 0.9)
+    scale(first, done)
+    scale.restart()
+    other = RewardScale(2, 0.9)
+    other.load_state_dict(scale.state_dict())
+    assert torch.equal(scale(first, done), other(first, done))
+
+
+def judged(log_prob, value=0.0, target=None):
+    """Return an agent that judges every action as given."""
+    values = [torch.as_tensor(x, dtype=torch.float) for x in (log_prob, 1.0, value)]
+    judgement = Judgement(*values, target)
+    config = SimpleNamespace(auxiliary_weight=2.0)
+    return SimpleNamespace(evaluate_actions=lambda *_: judgement, config=config)
+
+
+def batch_of(advantage, returns=(0.0, 0.0), **state):
+    size = len(advantage)
+    rows = (torch.tensor(advantage), torch.tensor(returns))
+    return Batch(state, torch.zeros(size, 1), torch.zeros(size), *rows)
+
+
+def test_policy_loss_is_clipped_by_hand():
+    agent = judged([math.log(1.5), math.log(0.5)], value=[0.0, 0.0])
+    _, terms = ppo.ppo_loss(agent, batch_of([1.0, -1.0]), PPOConfig(clip=0.2))
+    # min(1.5, 1.2) for the good action; min(-0.5, -0.8) for the bad one
+    assert float(terms["policy"]) == pytest.approx(-(1.2 - 0.8) / 2)
+    assert float(terms["clipped"]) == 1.0
+
+
+def test_value_entropy_and_auxiliary_losses_by_hand():
+    agent = judged([0.0, 0.0], value=[1.0, 3.0], target=torch.full((2, 3), 0.3))
+    config = PPOConfig(value_weight=0.5, entropy_weight=0.1)
+    place = {"target_position": torch.full((2, 3), 0.1)}
+    loss, terms = ppo.ppo_loss(
+        agent, batch_of([1.0, -1.0], (0.0, 0.0), **place), config
+    )
+    assert float(terms["value"]) == pytest.approx(2.5)
+    assert float(terms["auxiliary"]) == pytest.approx(4.0)  # 2 dm off, squared
+    assert float(loss) == pytest.approx(0.5 * 2.5 - 0.1 * 1.0 + 2.0 * 4.0)
+
+
+def test_minibatches_cover_every_step_once():
+    rollout = SimpleNamespace(steps=10, num_envs=10, reward=torch.zeros(1))
+    parts = list(ppo.minibatches(rollout, PPOConfig(minibatch=30)))
+    assert [len(part) for part in parts] == [34, 33, 33]
+    assert torch.cat(parts).sort()[0].tolist() == list(range(100))
+    assert len(list(ppo.minibatches(rollout, PPOConfig(minibatch=None)))) == 1
+
+
+def collected(config):
+    envs, stack = ToyVectorEnv(8), StateStack(3)
+    state = stack.reset(envs.reset(seed=0)[0])
+    torch.manual_seed(0)
+    agent = Agent(config.agent, StateSpec.of(state, 2))
+    rollout = Rollout(16, state, 2)
+    state, _ = collect(envs, stack, state, agent, rollout, config.ppo)
+    rollout.finish(torch.zeros(8), 0.9, 0.95)
+    return agent, torch.optim.Adam(agent.parameters(), 0.01), rollout
+
+
+def test_epochs_stop_once_the_policy_moved_far_enough():
+    agent, optimizer, rollout = collected(toy_config("x"))
+    eager = PPOConfig(epochs=20, minibatch=64, max_kl=1e-3)
+    assert ppo.update(agent, optimizer, rollout, eager)["epochs"] < 20
+
+
+def test_the_gradient_is_cut_to_its_longest_length():
+    agent, _, rollout = collected(toy_config("x"))
+    loss, _ = ppo.ppo_loss(agent, rollout.batch(torch.arange(128)), PPOConfig())
+    (1000 * loss).backward()
+    assert float(ppo.clip_gradient(agent, 0.5)) > 0.5
+    norms = [p.grad.norm() for p in agent.parameters() if p.grad is not None]
+    assert float(torch.stack(norms).norm()) == pytest.approx(0.5, rel=1e-3)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_what_is_no_number_is_named_with_a_cause(value):
+    tensors = {"fine": torch.ones(2), "guilty": torch.tensor([1.0, value])}
+    with pytest.raises(
+        TrainingDivergedError, match=r"observation.*: guilty; .*unstable"
+    ):
+        check_finite(tensors, "observation", "the simulation became unstable")
+
+
+def test_large_but_finite_numbers_are_no_alarm():
+    check_finite({"a": torch.full((2,), 3e38), "b": torch.ones(1).long()}, "x", "y")
+
+
+def test_an_exploding_gradient_is_named():
+    agent, optimizer, rollout = collected(toy_config("x"))
+    rollout.advantage[3, 2] = math.nan
+    with pytest.raises(TrainingDivergedError, match="loss is no longer finite: policy"):
+        ppo.update(agent, optimizer, rollout, PPOConfig(minibatch=128))
+    next(agent.parameters()).grad = torch.full_like(next(agent.parameters()), math.inf)
+    with pytest.raises(TrainingDivergedError, match=r"gradient.*encoder.language"):
+        ppo.clip_gradient(agent, 0.5)
+
+
+@pytest.mark.parametrize("critic", ["asymmetric", "shared"])
+def test_ppo_learns_to_reach_the_named_number(critic, tmp_path):
+    config = toy_config(tmp_path)
+    config = replace(config, agent=replace(config.agent, critic=critic))
+    envs, stack = ToyVectorEnv(8), StateStack(3)
+    state = stack.reset(envs.reset(seed=0)[0])
+    torch.manual_seed(0)
+    agent = Agent(config.agent, StateSpec.of(state, 2))
+    optimizer = torch.optim.Adam(agent.parameters(), 3e-3)
+    rollout = Rollout(32, state, 2)
+    rewards = []
+    for _ in range(12):
+        state, sums = collect(envs, stack, state, agent, rollout, config.ppo)
+        rollout.finish(agent.value(state).detach(), 0.9, 0.95)
+        ppo.update(agent, optimizer, rollout, config.ppo)
+        rewards.append(sums.means()["reward"])
+    assert rewards[0] < 0.35
+    for told, goal in enumerate(GOALS):
+        state = stack.reset(envs.reset(seed=9, options={"instruction": told})[0])
+        for _ in range(6):
+            state = stack.push(envs.step(agent.policy(state))[0])
+        assert (envs.joints[:, 0] - goal).abs().max() < 0.2

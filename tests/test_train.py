@@ -1,0 +1,256 @@
+import csv
+import dataclasses
+import json
+
+import pytest
+import torch
+from toy_envs import LENGTH, ToyVectorEnv, toy_config
+
+from ir_maniskill.training import checkpoint
+from ir_maniskill.training import train as training
+from ir_maniskill.training.checkpoint import CheckpointError
+from ir_maniskill.training.config import AgentConfig, TrainConfig
+from ir_maniskill.training.finite import TrainingDivergedError
+from ir_maniskill.training.train import train
+
+UPDATE = 32 * LENGTH  # steps of an update of the toy task
+
+
+@pytest.fixture(autouse=True)
+def few_final_episodes(monkeypatch):
+    monkeypatch.setattr(training, "FINAL_EPISODES", 16)
+
+
+def run(config, **kwargs):
+    return train(config, envs=ToyVectorEnv(config.num_envs), **kwargs)
+
+
+def rows(folder, table):
+    with (folder / f"{table}.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def tensors(folder):
+    return checkpoint.read(folder / "last.safetensors").tensors
+
+
+def assert_same(first, second):
+    assert first.keys() == second.keys()
+    different = [name for name in first if not torch.equal(first[name], second[name])]
+    assert not different
+
+
+@pytest.fixture
+def interrupt(monkeypatch):
+    """Make the training stop as if by Ctrl-C in its n-th update."""
+
+    def at(count):
+        update, calls = training.ppo.update, []
+
+        def interrupted(*arguments):
+            calls.append(None)
+            if len(calls) == count:
+                raise KeyboardInterrupt
+            return update(*arguments)
+
+        monkeypatch.setattr(training.ppo, "update", interrupted)
+
+    return at
+
+
+def test_training_learns_the_toy_task_and_stops_when_told(tmp_path):
+    ppo = dataclasses.replace(toy_config(tmp_path).ppo, learning_rate=3e-3)
+    config = toy_config(
+        tmp_path,
+        ppo=ppo,
+        total_steps=60 * UPDATE,
+        eval_interval=3 * UPDATE,
+        stop_at_success=1.0,
+    )
+    best = run(config)
+    assert best == tmp_path / "best.safetensors"
+    steps = [int(row["steps"]) for row in rows(tmp_path, "metrics")]
+    assert steps[-1] < 60 * UPDATE
+    assert float(rows(tmp_path, "evaluations")[-1]["eval/worst"]) == 1.0
+    report = json.loads((tmp_path / "evaluation.json").read_text())
+    assert (report["episodes"], report["overall"]["success"]) == (16, 1.0)
+    _, stored, metadata = checkpoint.load_policy(best)
+    assert stored == config
+    assert metadata["evaluation"] == report
+
+
+def test_training_leaves_its_records(tmp_path):
+    run(toy_config(tmp_path))
+    names = {path.name for path in tmp_path.iterdir()}
+    expected = {"config.json", "metrics.csv", "evaluations.csv", "evaluation.json"}
+    assert expected | {"best.safetensors", "last.safetensors"} <= names
+    assert any("tfevents" in name for name in names)
+    assert [int(row["steps"]) for row in rows(tmp_path, "metrics")] == [
+        UPDATE * i for i in (1, 2, 3, 4)
+    ]
+
+
+@pytest.mark.parametrize("images", [False, True])
+def test_a_run_resumed_at_a_checkpoint_equals_one_never_interrupted(
+    tmp_path, interrupt, images
+):
+    senses = ("vision", "proprioception") if images else ("proprioception",)
+    changes = {} if not images else {"camera_height": 16, "camera_width": 8}
+    agent = AgentConfig(senses=senses, hidden=(32, 32), language_layers=1)
+
+    def config(name):
+        return toy_config(tmp_path / name, agent=agent, **changes)
+
+    def go(config, **kwargs):
+        train(config, envs=ToyVectorEnv(8, images=images), **kwargs)
+
+    go(config("whole"))
+    interrupt(3)  # after the checkpoint that follows the second update
+    with pytest.raises(KeyboardInterrupt):
+        go(config("halves"))
+    torch.manual_seed(123)  # whatever happens in between
+    go(config("halves"), resume=True)
+    assert_same(tensors(tmp_path / "whole"), tensors(tmp_path / "halves"))
+    times = ("time/collect", "time/update")
+    first, second = (
+        [{k: v for k, v in row.items() if k not in times} for row in records]
+        for records in (rows(tmp_path / n, "metrics") for n in ("whole", "halves"))
+    )
+    assert first == second
+
+
+def test_evaluating_changes_nothing_in_the_weights_to_come(tmp_path):
+    each = {"checkpoint_interval": UPDATE}
+    run(toy_config(tmp_path / "never", **each))
+    run(toy_config(tmp_path / "often", eval_interval=UPDATE, **each))
+    assert_same(tensors(tmp_path / "never"), tensors(tmp_path / "often"))
+
+
+def test_the_same_seed_gives_the_same_weights_and_another_one_others(tmp_path):
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        run(toy_config(tmp_path / name, seed=seed, total_steps=UPDATE))
+    a, b, c = (tensors(tmp_path / name) for name in "abc")
+    assert_same(a, b)
+    assert not torch.equal(
+        a["agent.actor.mean.0.weight"], c["agent.actor.mean.0.weight"]
+    )
+
+
+def test_ctrl_c_keeps_the_last_complete_update(tmp_path, interrupt):
+    interrupt(2)
+    with pytest.raises(KeyboardInterrupt):
+        run(toy_config(tmp_path))
+    stored = checkpoint.read(tmp_path / "last.safetensors")
+    assert stored.metadata["steps"] == UPDATE
+
+
+def test_records_of_steps_made_again_are_dropped(tmp_path, interrupt):
+    interrupt(4)
+    with pytest.raises(KeyboardInterrupt):
+        run(toy_config(tmp_path))
+    run(toy_config(tmp_path), resume=True)
+    steps = [int(row["steps"]) for row in rows(tmp_path, "metrics")]
+    assert steps == [UPDATE * i for i in (1, 2, 3, 4)]
+
+
+def test_a_finished_run_can_be_prolonged(tmp_path):
+    run(toy_config(tmp_path, total_steps=UPDATE))
+    run(toy_config(tmp_path, total_steps=2 * UPDATE), resume=True)
+    assert (
+        checkpoint.read(tmp_path / "last.safetensors").metadata["steps"] == 2 * UPDATE
+    )
+
+
+def test_a_folder_with_a_run_is_not_overwritten(tmp_path):
+    config = toy_config(tmp_path, total_steps=UPDATE)
+    run(config)
+    with pytest.raises(CheckpointError, match="already holds a run: resume"):
+        run(config)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"env_id": "Other-v1"}, "env_id .checkpoint: 'Toy-v1', now: 'Other-v1'"),
+        ({"seed": 5}, "seed .checkpoint: 0, now: 5"),
+    ],
+)
+def test_another_task_or_config_cannot_be_resumed(tmp_path, change, message):
+    config = toy_config(tmp_path, total_steps=UPDATE)
+    run(config)
+    with pytest.raises(CheckpointError, match=message):
+        run(dataclasses.replace(config, **change), resume=True)
+
+
+def test_a_broken_checkpoint_is_refused(tmp_path):
+    config = toy_config(tmp_path, total_steps=UPDATE)
+    run(config)
+    last = tmp_path / "last.safetensors"
+    last.write_bytes(last.read_bytes()[:1000])
+    with pytest.raises(CheckpointError, match="cut short"):
+        run(config, resume=True)
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_training(tmp_path):
+    (tmp_path / "file").write_text("not a folder")
+    with pytest.raises(CheckpointError, match=r"cannot write to .*choose another"):
+        run(toy_config(tmp_path / "file" / "run"))
+
+
+def test_a_full_disk_is_refused_before_training(tmp_path, monkeypatch):
+    usage = training.RunFolder.__init__.__globals__["shutil"].disk_usage(tmp_path)
+    full = usage._replace(free=1_000_000)
+    monkeypatch.setattr("shutil.disk_usage", lambda _: full)
+    with pytest.raises(CheckpointError, match="got 1 MB of free space"):
+        run(toy_config(tmp_path))
+
+
+def test_divergence_keeps_the_last_good_checkpoint(tmp_path, monkeypatch):
+    envs = ToyVectorEnv(8)
+    step, calls = envs.step, []
+
+    def explode(action):
+        calls.append(None)
+        obs, *rest = step(action)
+        if len(calls) > 3 * UPDATE // 8:
+            obs["agent"]["proprioception"][0, 0] = torch.nan
+        return obs, *rest
+
+    envs.step = explode
+    with pytest.raises(TrainingDivergedError, match=r"observation.*: proprioception"):
+        train(toy_config(tmp_path), envs=envs)
+    stored = checkpoint.read(tmp_path / "last.safetensors")
+    assert stored.metadata["steps"] == 2 * UPDATE
+    assert all(v.isfinite().all() for v in stored.tensors.values())
+
+
+def test_the_noise_shrinks_as_steps_are_made(tmp_path):
+    run(toy_config(tmp_path))
+    got = [float(row["std"]) for row in rows(tmp_path, "metrics")]
+    assert got == pytest.approx([0.5, 0.425, 0.35, 0.275], abs=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.render
+def test_the_real_task_resumes_bit_for_bit(tmp_path, interrupt):
+    def config(name):
+        update = {"rollouts": 4, "epochs": 2, "minibatch": 64}
+        ppo = dataclasses.replace(TrainConfig().ppo, **update)
+        intervals = {"checkpoint_interval": 128, "eval_interval": 10**6}
+        return TrainConfig(
+            out=str(tmp_path / name),
+            total_steps=4 * 128,
+            num_envs=4,
+            num_workers=2,
+            threads=1,
+            eval_episodes=4,
+            ppo=ppo,
+            **intervals,
+        )
+
+    train(config("whole"))
+    interrupt(3)
+    with pytest.raises(KeyboardInterrupt):
+        train(config("halves"))
+    train(config("halves"), resume=True)
+    assert_same(tensors(tmp_path / "whole"), tensors(tmp_path / "halves"))

@@ -1,0 +1,115 @@
+"""A task small enough to be learned in seconds, for the tests of the learner."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+
+from ir_maniskill.training.config import AgentConfig, PPOConfig, TrainConfig
+
+LENGTH = 8  # steps of an episode
+JOINTS, FINGERS = 2, 2
+SENTENCES = ("Go left.", "Go right.")
+GOALS = torch.tensor([-0.6, 0.6])
+
+
+class ToyVectorEnv:
+    """Reach the named number: joint 0 shall be at the goal that the sentence names.
+
+    It offers what `make_vec` promises: same-step reset, final observation and info.
+    """
+
+    def __init__(self, num_envs=8, images=False):
+        self.num_envs, self.images = num_envs, images
+        self.device = torch.device("cpu")
+        self.single_action_space = Box(-1, 1, (JOINTS,))
+        senses = ("vision", "proprioception") if images else ("proprioception",)
+        self.experiment = SimpleNamespace(sentences=SENTENCES, senses=senses)
+        self.joints = torch.zeros(num_envs, JOINTS)
+        self.told = torch.zeros(num_envs, dtype=torch.long)
+        self.clock = torch.zeros(num_envs, dtype=torch.long)
+        self.touched = torch.zeros(num_envs, dtype=torch.bool)
+        self.streams = [np.random.default_rng(i) for i in range(num_envs)]
+
+    @torch.inference_mode(False)
+    def reset(self, *, seed=None, options=None):
+        if seed is not None:
+            rows = range(self.num_envs)
+            self.streams = [np.random.default_rng(seed + i) for i in rows]
+        self._start(torch.ones(self.num_envs, dtype=torch.bool))
+        if options:
+            self.told[:] = options["instruction"]
+        return self._observe(), {}
+
+    @torch.inference_mode(False)
+    def step(self, action):
+        assert action.abs().max() <= 1, "actions must arrive clipped"
+        self.joints = (self.joints + 0.3 * action).clamp(-1, 1)
+        self.clock += 1
+        right = (self.joints[:, 0] - GOALS[self.told]).abs() < 0.2
+        self.touched |= right
+        info = {
+            "right_fingers": right.long(),
+            "wrong_fingers": torch.zeros_like(self.told),
+            "success_once": self.touched.clone(),
+            "exclusive_success": self.touched.clone(),
+        }
+        truncated = self.clock >= LENGTH
+        if truncated.any():
+            info = {"final_observation": self._observe(), "final_info": info}
+            self._start(truncated)
+        return self._observe(), right.float(), torch.zeros_like(right), truncated, info
+
+    def close(self):
+        pass
+
+    def _start(self, chosen):
+        for row in chosen.nonzero().flatten().tolist():
+            stream = self.streams[row]
+            self.told[row] = int(stream.integers(2))
+            self.joints[row] = torch.from_numpy(stream.uniform(-0.1, 0.1, JOINTS))
+        self.clock[chosen], self.touched[chosen] = 0, False
+
+    def _observe(self):
+        goal = GOALS[self.told][:, None]
+        one_hot = torch.nn.functional.one_hot(self.told, 2).float()
+        obs = {
+            "agent": {
+                "proprioception": self.joints.clone(),
+                "target": self.joints.clone(),
+                "velocity": torch.zeros_like(self.joints),
+            },
+            "extra": {
+                "touch": torch.zeros(self.num_envs, FINGERS),
+                "instruction": torch.stack([self.told + 3, self.told * 0], dim=1),
+                "object_position": GOALS[None, :, None].repeat(self.num_envs, 1, 3),
+                "finger_position": goal[:, None].repeat(1, FINGERS, 3),
+                "target_object": one_hot,
+            },
+        }
+        if self.images:
+            brightness = (100 * (self.joints[:, 0] + 1)).byte()
+            image = brightness[:, None, None, None].repeat(1, 16, 8, 3)
+            cameras = ("top_camera", "front_camera")
+            obs["sensor_data"] = {name: {"rgb": image.clone()} for name in cameras}
+        return obs
+
+
+def toy_config(out, **changes):
+    """Return a config with which the toy task is learned in seconds."""
+    agent = AgentConfig(senses=("proprioception",), hidden=(32, 32), language_layers=1)
+    ppo = PPOConfig(rollouts=32, rollout_length=LENGTH, minibatch=64)
+    values = {
+        "env_id": "Toy-v1",
+        "out": str(out),
+        "total_steps": 32 * LENGTH * 4,
+        "num_envs": 8,
+        "threads": 1,
+        "eval_episodes": 8,
+        "eval_interval": 10**6,
+        "checkpoint_interval": 2 * 32 * LENGTH,
+        "agent": agent,
+        "ppo": ppo,
+    }
+    return TrainConfig(**(values | changes))
