@@ -1,6 +1,6 @@
 """Builds `nao.urdf` and its meshes from the fact tables: `python -m <this module>`.
 
-The same sources give the same bytes. Only the 26 driven joints remain; everything
+The same sources give the same files. Only the 26 driven joints remain; everything
 else is merged, in the posture of `facts/posture.csv`, into the link `torso`.
 """
 
@@ -8,7 +8,7 @@ import argparse
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -71,14 +71,17 @@ _ARM_MESHES = {
     "_wrist": "hand",
 }
 
+_FINGERTIPS = ("Finger13_link", "Finger23_link", "Thumb2_link")
+
+# Shoulders and elbows need none: they are never the first to touch anything.
 _COLLISIONS: dict[str, tuple[Shape, ...]] = {
-    "torso": (
+    ROOT: (
         Box((0.0, 0.0, 0.0), (0.090, 0.120, 0.220)),
         Ball((0.0, 0.0, 0.180), 0.060),
     ),
     "Bicep": (Box((0.025, 0.009, 0.0), (0.070, 0.044, 0.044)),),
     "ForeArm": (Box((0.030, 0.001, 0.0), (0.046, 0.042, 0.042)),),
-    "_wrist": (Box((0.037, 0.0, 0.001), (0.058, 0.046, 0.038)),),
+    "_wrist": (Box((0.037, 0.0, -0.001), (0.058, 0.046, 0.042)),),
 }
 
 
@@ -135,19 +138,12 @@ def link_inertials(
 
 
 def merged_inertial(table: Mapping[str, Inertial], moving: list[str]) -> Inertial:
-    """Returns all that never moves as one body in the torso's frame."""
+    """Returns all that never moves, sensor frames aside, as one body of the torso."""
     frames = posture_frames()
-    return lump_of(
-        {link: body for link, body in table.items() if link not in moving}, frames
-    )
-
-
-def lump_of(bodies: Mapping[str, Inertial], frames: Frames) -> Inertial:
-    """Returns the bodies, massless sensor frames aside, as one body."""
     return facts.lump(
         body.moved(frames[link])
-        for link, body in bodies.items()
-        if body.mass > facts.NEGLIGIBLE_MASS
+        for link, body in table.items()
+        if link not in moving and body.mass > facts.NEGLIGIBLE_MASS
     )
 
 
@@ -168,24 +164,22 @@ def _mesh_of(link: str) -> str:
     if link == ROOT:
         return "torso"
     if _is_finger(link):
-        return "fingertip" if link[1:] in _TIPS else "phalanx"
+        return "fingertip" if link[1:] in _FINGERTIPS else "phalanx"
     return f"{link[0].lower()}_{_ARM_MESHES[link[1:]]}"
 
 
-_TIPS = ("Finger13_link", "Finger23_link", "Thumb2_link")
-
-
 def _shapes_of(link: str) -> tuple[Shape, ...]:
+    if link == ROOT:
+        return _COLLISIONS[ROOT]
     if _is_finger(link):
         return _PHALANX_SHAPES
-    if link[0] in "Rr":
-        return tuple(_mirrored(shape) for shape in _COLLISIONS.get(link[1:], ()))
-    return _COLLISIONS.get(link, _COLLISIONS.get(link[1:], ()))
+    shapes = _COLLISIONS.get(link[1:], ())
+    return shapes if link[0] in "Ll" else tuple(map(_mirrored, shapes))
 
 
 def _mirrored(shape: Shape) -> Shape:
     x, y, z = shape.center
-    return type(shape)((x, -y, z), *list(vars(shape).values())[1:])
+    return replace(shape, center=(x, -y, z))
 
 
 def _link(name: str, inertial: Inertial) -> ET.Element:
@@ -244,11 +238,12 @@ def _joint(row: Row, actuation: Actuation) -> ET.Element:
 
 
 def _number(value: float) -> str:
-    return f"{value:.6g}"
+    # Rounded first, so that what should be zero is zero on every machine.
+    return f"{round(value, 15) + 0.0:.6g}"
 
 
 def _text(values: np.ndarray | list[float] | _Vector) -> str:
-    return " ".join(_number(value + 0.0) for value in values)
+    return " ".join(_number(value) for value in values)
 
 
 if __name__ == "__main__":

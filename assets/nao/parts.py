@@ -3,7 +3,6 @@
 The left side is drawn; the right side is its mirror image. Lengths are in [m].
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +18,7 @@ PALETTE = (
     (142, 149, 160),  # GREY: joints
     (74, 80, 92),  # DARK: rubber
     (24, 26, 32),  # BLACK: lenses and eye rings
-    (244, 122, 32),  # ORANGE: accents
+    (255, 160, 56),  # ORANGE: accents
     (72, 196, 255),  # CYAN: lit eyes
     (232, 250, 255),  # GLOW: what shines brightest
 )
@@ -163,7 +162,7 @@ def _eye() -> Surface:
         segments=12,
     )
     highlight = _spot(GLOW, 0.0030, segments=5).shifted(0.0065, -0.0035, 0.0045)
-    return join([eye, highlight]).turned(0, -0.04, 0.42).shifted(0.0515, 0.0262, 0.049)
+    return join([eye, highlight]).turned(0, -0.04, 0.48).shifted(0.0535, 0.0280, 0.0485)
 
 
 def _ear() -> Surface:

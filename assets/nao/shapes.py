@@ -34,8 +34,6 @@ class Section:
     """Middle of the section in the plane of u and v [m]."""
     power: float = 2.0
     """2 is an ellipse, more is boxier."""
-    crease: bool = False
-    """Whether the surface has a hard edge here."""
 
 
 @dataclass(frozen=True)
@@ -89,12 +87,15 @@ class Surface:
 
 def join(surfaces: Sequence[Surface]) -> Surface:
     """Returns the surfaces as one, their smoothing groups kept apart."""
+    corners = [len(part.vertices) for part in surfaces]
+    groups = [part.groups.max() + 1 for part in surfaces]
+    cells = [part.cells.max() + 1 for part in surfaces]
     return Surface(
         np.concatenate([part.vertices for part in surfaces]),
-        _renumbered([p.faces for p in surfaces], [len(p.vertices) for p in surfaces]),
+        _renumbered([part.faces for part in surfaces], corners),
         np.concatenate([part.colors for part in surfaces]),
-        _renumbered([p.groups for p in surfaces], [p.groups.max() + 1 for p in surfaces]),
-        _renumbered([p.cells for p in surfaces], [p.cells.max() + 1 for p in surfaces]),
+        _renumbered([part.groups for part in surfaces], groups),
+        _renumbered([part.cells for part in surfaces], cells),
     )
 
 
@@ -116,6 +117,7 @@ def loft(
         segments: Points per section.
         caps: Which ends not closed in a point get a flat lid: "low", "high", "both"
             or "none"; leave off what nobody can see.
+        lid: Color of the lids, else that of the span next to them.
     """
     spans = len(sections) - 1
     colors = [colors] * spans if isinstance(colors, int) else list(colors)
@@ -123,7 +125,7 @@ def loft(
     for section in sections:
         builder.add_ring(section)
     for span, color in enumerate(colors):
-        builder.add_span(span, color, sections[span].crease)
+        builder.add_span(span, color)
     if caps in ("low", "both") and any(sections[0].half):
         color = colors[0] if lid is None else lid
         builder.add_lid(0, sections[0], color, up=False)
@@ -164,20 +166,14 @@ def bake(
         colors: The palette that the surface's colors point into.
         light: Where the baked light comes from, in the frame of the surface.
     """
-    keys = np.stack(
-        [surface.faces, *(np.repeat(a[:, None], 3, 1) for a in _tags(surface))], -1
-    ).reshape(-1, 3)  # [3F, 3]: corner, group, color
+    tags = np.stack([surface.groups, surface.colors], -1)  # [F, 2]
+    keys = np.concatenate(
+        [surface.faces.reshape(-1, 1), np.repeat(tags, 3, axis=0)], axis=-1
+    )  # [3F, 3]: corner, group, color
     unique, faces = np.unique(keys, axis=0, return_inverse=True)
-    normals = _smooth_normals(surface)[unique[:, 0], unique[:, 1]]  # [V, 3]
-    toward = np.asarray(light, float) / np.linalg.norm(light)
-    shade = (1 + normals @ toward) / 2  # [V] in [0, 1]
-    uv = np.stack(
-        [
-            (unique[:, 2] + 0.5) / len(colors),
-            (0.5 + shade * (_LEVELS - 1)) / _LEVELS,
-        ],
-        axis=-1,
-    )
+    corner, group, color = unique.T  # [V] each: a vertex per corner, group, color
+    normals = _smooth_normals(surface)[corner, group]  # [V, 3]
+    uv = _texture_coordinates(color, normals, len(colors), light)
     material = PBRMaterial(
         name="palette",
         baseColorTexture=palette(colors),
@@ -185,7 +181,7 @@ def bake(
         roughnessFactor=0.55,
     )
     return trimesh.Trimesh(
-        surface.vertices[unique[:, 0]],
+        surface.vertices[corner],
         faces.reshape(-1, 3),
         vertex_normals=normals,
         visual=trimesh.visual.TextureVisuals(uv, material=material),
@@ -199,8 +195,15 @@ def _renumbered(indices: Sequence[np.ndarray], counts: Sequence[int]) -> np.ndar
     return np.concatenate([i + n for i, n in zip(indices, shifts, strict=True)])
 
 
-def _tags(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
-    return surface.groups, surface.colors
+def _texture_coordinates(
+    color: np.ndarray, normals: np.ndarray, colors: int, light: Sequence[float]
+) -> np.ndarray:
+    """Returns where in the palette each vertex looks, shape [V, 2]."""
+    toward = np.asarray(light, float) / np.linalg.norm(light)
+    shade = (1 + normals @ toward) / 2  # [V] in [0, 1]
+    return np.stack(
+        [(color + 0.5) / colors, (0.5 + shade * (_LEVELS - 1)) / _LEVELS], axis=-1
+    )
 
 
 def _smooth_normals(surface: Surface) -> np.ndarray:
@@ -242,9 +245,8 @@ class _Builder:
             self._vertices.append(np.array([section.at, u, v]))
         self._rings.append(first + np.arange(self._segments))
 
-    def add_span(self, span: int, color: int, crease: bool) -> None:
+    def add_span(self, span: int, color: int) -> None:
         """Adds the skin between section `span` and the next."""
-        self._group += crease
         low, high = self._rings[span : span + 2]
         for i in range(self._segments):
             j = (i + 1) % self._segments

@@ -1,0 +1,249 @@
+"""The NAO model says what its fact tables say, and is what its script builds."""
+
+import csv
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+import yourdfpy
+
+from ir_maniskill.assets.nao import SOLE_HEIGHT, URDF_PATH, build
+
+FACTS = Path(build.__file__).parent / "facts"
+MESHES = URDF_PATH.parent / "meshes"
+FIXED_POSTURE = {
+    "HeadPitch": 0.15,
+    "LHipPitch": -0.45,
+    "LKneePitch": 0.70,
+    "LAnklePitch": -0.25,
+    "RHipPitch": -0.45,
+    "RKneePitch": 0.70,
+    "RAnklePitch": -0.25,
+}
+ARM = ("ShoulderPitch", "ShoulderRoll", "ElbowYaw", "ElbowRoll", "WristYaw")
+HAND = (
+    *("Finger11", "Finger12", "Finger13"),
+    *("Finger21", "Finger22", "Finger23"),
+    *("Thumb1", "Thumb2"),
+)
+JOINTS = tuple(side + name for side in "LR" for name in ARM + HAND)
+ARM_LIMITS_DEG = {
+    "ShoulderPitch": (-119.5, 119.5),
+    "ShoulderRoll": (-18, 76),
+    "ElbowYaw": (-119.5, 119.5),
+    "ElbowRoll": (-88.5, -2),
+    "WristYaw": (-104.5, 104.5),
+}
+
+
+def read_facts(table: str, key: str) -> dict[str, dict[str, str]]:
+    """Returns a fact table by the values of one of its columns."""
+    with (FACTS / f"{table}.csv").open(newline="") as file:
+        return {row[key]: row for row in csv.DictReader(file)}
+
+
+def rotation(axis: np.ndarray, angle: float) -> np.ndarray:
+    """Returns Rodrigues' rotation [3, 3]."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+
+
+def joint_frame(row: dict[str, str], angle: float) -> np.ndarray:
+    """Returns the frame of a joint's child in that of its parent [4, 4]."""
+    roll, pitch, yaw = (float(row[f"{name}_rad"]) for name in ("roll", "pitch", "yaw"))
+    x, y, z = np.eye(3)
+    turn = rotation(z, yaw) @ rotation(y, pitch) @ rotation(x, roll)
+    if row["axis_x"]:
+        axis = np.array([float(row[f"axis_{name}"]) for name in "xyz"])
+        turn = turn @ rotation(axis / np.linalg.norm(axis), angle)
+    frame = np.eye(4)
+    frame[:3, :3] = turn
+    frame[:3, 3] = [float(row[f"origin_{name}_m"]) for name in "xyz"]
+    return frame
+
+
+def link_frame(link: str, angles: dict[str, float]) -> np.ndarray:
+    """Returns the frame of a link in the torso's, from the fact table [4, 4]."""
+    parents = read_facts("joints", "child_link")
+    frame = np.eye(4)
+    while link != "torso":
+        row = parents[link]
+        frame = joint_frame(row, angles.get(row["joint"], 0.0)) @ frame
+        link = row["parent_link"]
+    return frame
+
+
+@pytest.fixture(scope="module")
+def model() -> yourdfpy.URDF:
+    """Returns the URDF as an independent library reads it."""
+    return yourdfpy.URDF.load(
+        str(URDF_PATH), load_meshes=False, build_collision_scene_graph=False
+    )
+
+
+@pytest.fixture(scope="module")
+def moving_links(model: yourdfpy.URDF) -> list[str]:
+    """Returns the links that move, in the order of the joints."""
+    return [model.joint_map[name].child for name in JOINTS]
+
+
+def test_only_the_26_joints_move_and_they_are_in_the_order_of_the_action(model):
+    assert tuple(model.joint_map) == JOINTS
+    assert {joint.type for joint in model.joint_map.values()} == {"revolute"}
+    assert all(joint.mimic is None for joint in model.joint_map.values())
+    assert len(model.link_map) == 27
+    assert model.base_link == "torso"
+
+
+@pytest.mark.parametrize("seed", [None, 0, 1, 2, 3])
+def test_kinematics_match_the_fact_table(model, moving_links, seed):
+    limits = [model.joint_map[name].limit for name in JOINTS]
+    angles = np.zeros(len(JOINTS))
+    if seed is not None:
+        rng = np.random.default_rng(seed)
+        angles = rng.uniform([x.lower for x in limits], [x.upper for x in limits])
+    by_name = dict(zip(JOINTS, angles.tolist(), strict=True))
+    model.update_cfg(by_name)
+    for link in moving_links:
+        expected = link_frame(link, by_name)
+        got = model.get_transform(link, "torso")
+        np.testing.assert_allclose(got, expected, atol=1e-4, err_msg=link)
+
+
+def test_limits_are_those_of_the_reference_simulation(model):
+    for name in JOINTS:
+        lower, upper = ARM_LIMITS_DEG.get(name[1:], (0, 60))
+        if name.startswith("R") and "Roll" in name:
+            lower, upper = -upper, -lower
+        limit = model.joint_map[name].limit
+        assert math.degrees(limit.lower) == pytest.approx(lower, abs=1e-3), name
+        assert math.degrees(limit.upper) == pytest.approx(upper, abs=1e-3), name
+
+
+def test_effort_and_velocity_are_those_of_the_motors(model):
+    table = read_facts("joints", "joint")
+    for name in JOINTS:
+        motor = table[name if name[1:] in ARM else f"{name[0]}Hand"]
+        limit = model.joint_map[name].limit
+        assert limit.effort == pytest.approx(float(motor["effort_nm"])), name
+        assert limit.velocity == pytest.approx(float(motor["velocity_rad_s"])), name
+
+
+def test_arm_links_have_the_mass_of_the_fact_table(model, moving_links):
+    table = read_facts("links", "link")
+    for link in moving_links:
+        inertial = model.link_map[link].inertial
+        finger = "Finger" in link or "Thumb" in link
+        expected = 0.004 if finger else float(table[link]["mass_kg"])
+        assert inertial.mass == pytest.approx(expected, rel=1e-5), link
+        if not finger:
+            com = [float(table[link][f"com_{axis}_m"]) for axis in "xyz"]
+            np.testing.assert_allclose(inertial.origin[:3, 3], com, atol=1e-8)
+
+
+def test_the_torso_carries_all_that_never_moves(model, moving_links):
+    table = read_facts("links", "link")
+    fixed = {
+        name: float(row["mass_kg"])
+        for name, row in table.items()
+        if name not in moving_links and float(row["mass_kg"]) > 1e-5
+    }
+    com = np.zeros(3)
+    for name, mass in fixed.items():
+        local = [float(table[name][f"com_{axis}_m"]) for axis in "xyz"]
+        com += mass * (link_frame(name, FIXED_POSTURE) @ np.array([*local, 1]))[:3]
+    torso = model.link_map["torso"].inertial
+    assert torso.mass == pytest.approx(sum(fixed.values()), rel=1e-5)
+    np.testing.assert_allclose(torso.origin[:3, 3], com / torso.mass, atol=1e-6)
+
+
+def test_the_robot_weighs_as_much_as_the_facts_and_its_fingers(model):
+    table = read_facts("links", "link")
+    facts = sum(float(row["mass_kg"]) for row in table.values())
+    total = sum(link.inertial.mass for link in model.link_map.values())
+    assert total == pytest.approx(facts + 16 * 0.004, abs=2e-4)
+
+
+def test_every_inertia_is_that_of_a_real_body(model):
+    for name, link in model.link_map.items():
+        small, middle, large = np.linalg.eigvalsh(link.inertial.inertia)
+        assert small >= 1e-7 * (1 - 1e-9), name
+        assert large <= (small + middle) * 1.001, name
+
+
+@pytest.mark.parametrize("side", ["l", "r"])
+def test_the_soles_stand_flat_on_the_ground(side):
+    sole = link_frame(f"{side}_sole", FIXED_POSTURE)
+    np.testing.assert_allclose(sole[:3, 2], [0, 0, 1], atol=1e-12)
+    assert sole[2, 3] == pytest.approx(SOLE_HEIGHT, abs=1e-6)
+
+
+@pytest.mark.parametrize("side", ["L", "R"])
+def test_fingers_curl_at_zero_and_stretch_at_sixty_degrees(model, side):
+    tips = [f"{side}Finger13_link", f"{side}Finger23_link"]
+    wrist = f"{side.lower()}_wrist"
+    reach = {}
+    for angle in (0.0, math.radians(60)):
+        model.update_cfg({name: angle for name in JOINTS if name[1:] in HAND})
+        along = [model.get_transform(tip, wrist)[:3, 0] for tip in tips]
+        reach[angle] = [axis[0] for axis in along]
+    curled, stretched = reach.values()
+    assert max(curled) < -0.9  # the tip points back to the wrist
+    assert min(stretched) > 0.9  # the tip points forward
+
+
+def test_collision_shapes_are_few_and_simple(model):
+    for name, link in model.link_map.items():
+        assert len(link.collisions) <= 2, name
+        for collision in link.collisions:
+            shape = collision.geometry
+            assert (shape.box is None) != (shape.sphere is None), name
+
+
+def test_the_urdf_is_what_the_script_writes():
+    assert URDF_PATH.read_text(encoding="utf-8") == build.urdf()
+
+
+def test_the_script_gives_the_same_files_every_time():
+    assert build.meshes() == build.meshes()
+
+
+def test_every_mesh_is_the_scripts_own():
+    built = build.meshes()
+    assert {path.name for path in MESHES.iterdir()} == set(built)
+    for name, content in built.items():
+        shipped = trimesh.load(MESHES / name, force="mesh", process=False)
+        fresh = trimesh.load(
+            trimesh.util.wrap_as_stream(content),
+            file_type="glb",
+            force="mesh",
+            process=False,
+        )
+        np.testing.assert_array_equal(shipped.faces, fresh.faces, err_msg=name)
+        np.testing.assert_allclose(shipped.vertices, fresh.vertices, atol=1e-6)
+        np.testing.assert_allclose(shipped.visual.uv, fresh.visual.uv, atol=1e-6)
+
+
+def test_meshes_are_cheap_and_one_draw_call_each(model):
+    total = 0
+    for name, link in model.link_map.items():
+        (visual,) = link.visuals
+        scene = trimesh.load(URDF_PATH.parent / visual.geometry.mesh.filename)
+        (mesh,) = scene.geometry.values()
+        budget = 1600 if name == "torso" else 36 if "_link" in name else 100
+        assert len(mesh.faces) <= budget, name
+        total += len(mesh.faces)
+    assert total <= 3000
+    assert f"{total:,} triangles" in (URDF_PATH.parent / "README.md").read_text()
+
+
+def test_mirrored_meshes_face_outward():
+    for path in MESHES.glob("[lr]_*.glb"):
+        mesh = trimesh.load(path, force="mesh")
+        outward = np.einsum(
+            "ij,ij->i", mesh.triangles_center - mesh.centroid, mesh.face_normals
+        )
+        assert np.average(outward > 0, weights=mesh.area_faces) > 0.8, path.name
