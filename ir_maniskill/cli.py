@@ -131,8 +131,17 @@ def run(arguments: Sequence[str]) -> int:
     except KeyboardInterrupt:
         return 130
     except (ValueError, RuntimeError, OSError, catalog.UnknownExperimentError) as error:
-        print(f"ir-maniskill: error: {error}", file=sys.stderr)
+        print(f"ir-maniskill: error: {_in_one_line(error)}", file=sys.stderr)
         return 2
+
+
+def _in_one_line(error: Exception) -> str:
+    """Returns an error's message, without a traceback that a worker sent along."""
+    message = str(error) or type(error).__name__
+    if "Traceback" not in message:
+        return message
+    lines = message.splitlines()
+    return f"{lines[0]} {lines[-1]}"
 
 
 def parse(arguments: Sequence[str]) -> Any:
@@ -141,11 +150,10 @@ def parse(arguments: Sequence[str]) -> Any:
     A preset gives the defaults of the other options of `train`, hence the look ahead.
     """
     ahead = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    ahead.add_argument("--preset", choices=CONFIGS, default="default")
-    try:
-        preset = ahead.parse_known_args(list(arguments))[0].preset
-    except SystemExit:
-        raise UsageError(f"--preset: expected one of {', '.join(CONFIGS)}") from None
+    ahead.add_argument("--preset", nargs="?", default="default")
+    preset = ahead.parse_known_args(list(arguments))[0].preset
+    if preset not in CONFIGS:
+        raise UsageError(f"--preset: got {preset!r}, available: {', '.join(CONFIGS)}")
     numbers = {f.name: getattr(CONFIGS[preset], f.name) for f in _TRAIN_FIELDS}
     options = TrainOptions(**{**numbers, "env_id": tyro.MISSING, "out": ""})
     commands = (
@@ -208,6 +216,8 @@ def _train(command: Train) -> int:
 def _evaluate(command: Evaluate) -> int:
     task = catalog.get(command.env_id)
     _require("num-envs", command.num_envs, least=1)
+    _require("episodes", command.episodes, least=1)
+    _require("seed", command.seed, least=0)
     chosen = _find_instruction(task, command.instruction)
     path = _find_policy(task, command.checkpoint)
     agent, config, facts = load_policy(path)
@@ -233,11 +243,13 @@ def _evaluate(command: Evaluate) -> int:
 def _video(command: Video) -> int:
     task = catalog.get(command.env_id)
     _require("episodes", command.episodes, least=1)
+    _require("seed", command.seed, least=0)
     if not 0.05 <= command.speed <= 4:
-        raise UsageError(f"speed: got {command.speed:g}, expected 0.05 to 4")
+        raise UsageError(f"--speed: got {command.speed:g}, expected 0.05 to 4")
     chosen = _find_instruction(task, command.instruction)
     agent, config, _ = load_policy(_find_policy(task, command.checkpoint))
     out = command.out or Path("runs") / f"{task.id}.mp4"
+    video.check_name(out)
     snapshots = video.record(
         agent.policy,
         task.id,

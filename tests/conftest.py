@@ -28,6 +28,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(scope="session")
+def env_kwargs() -> dict[str, Any]:
+    """What the envs below are made with."""
+    return dict(ENV_KWARGS)
+
+
+@pytest.fixture(scope="session")
 def multi_env() -> Iterator[gym.Env]:
     """One NaoTouchCubeMulti-v1 with small pictures; reset it before use."""
     env = gym.make("NaoTouchCubeMulti-v1", num_envs=1, **ENV_KWARGS)

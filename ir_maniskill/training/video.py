@@ -359,9 +359,7 @@ def write_video(
     Raises:
         ValueError: The name ends in neither .mp4 nor .gif, or there is nothing to show.
     """
-    writers = {".mp4": _write_mp4, ".gif": _write_gif}
-    if path.suffix not in writers:
-        raise ValueError(f"video: got {path}, expected a name ending in .mp4 or .gif")
+    check_name(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     rate = STEP_RATE * speed
     count = 0
@@ -373,12 +371,19 @@ def write_video(
             count += 1
             yield from [frame] * (1 + round(hold * rate) * last)
 
-    writers[path.suffix](path, frames(), rate)
+    write = _write_gif if path.suffix == ".gif" else _write_mp4
+    write(path, frames(), rate)
     if count == 0:
         raise ValueError(
             f"video: got no frames for {path}, expected at least one episode"
         )
     return count
+
+
+def check_name(path: Path) -> None:
+    """Raises ValueError unless the name ends in .mp4 or .gif."""
+    if path.suffix not in (".mp4", ".gif"):
+        raise ValueError(f"video: got {path}, expected a name ending in .mp4 or .gif")
 
 
 def _write_mp4(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:

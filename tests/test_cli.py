@@ -1,0 +1,164 @@
+import dataclasses
+import json
+
+import pytest
+import torch
+
+from ir_maniskill import cli, experiment
+from ir_maniskill.agent.agent import Agent, StateSpec
+from ir_maniskill.training import evaluate
+from ir_maniskill.training.checkpoint import save_policy
+from ir_maniskill.training.config import CONFIGS, TrainConfig
+
+IDS = [
+    f"NaoTouch{shape}{kind}-v1"
+    for shape in ("Cube", "Button")
+    for kind in ("Single", "Multi", "Triangle", "Shuffled")
+]
+
+
+def fails(capsys, *arguments):
+    """Run a command that must fail with one line, and return that line."""
+    assert cli.run(arguments) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith("ir-maniskill: error: ")
+    return lines[0]
+
+
+@pytest.fixture
+def policy_file(tmp_path):
+    """An untrained policy for small pictures."""
+    config = TrainConfig(camera_width=32, camera_height=64)
+    spec = StateSpec(5, 3, 2, 64, 32, 26, 6, 0, 26)
+    torch.manual_seed(0)
+    agent = Agent(config.agent, spec, policy_only=True)
+    path = tmp_path / "policy.safetensors"
+    save_policy(path, agent, config, steps=7, evaluation={})
+    return path
+
+
+def test_tasks_lists_all_eight_ids(capsys):
+    assert cli.run(["tasks"]) == 0
+    listed = [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:]]
+    assert set(IDS) <= set(listed)
+
+
+@pytest.mark.parametrize("command", ["train", "evaluate", "video"])
+def test_an_unknown_id_lists_those_there_are(command, capsys):
+    line = fails(capsys, command, "NaoTouchMoon-v1")
+    assert "got 'NaoTouchMoon-v1'" in line and all(name in line for name in IDS)
+
+
+def test_a_missing_checkpoint_is_named(capsys):
+    line = fails(
+        capsys, "evaluate", IDS[0], "--checkpoint", "/nowhere/best.safetensors"
+    )
+    assert "/nowhere/best.safetensors" in line and "existing file" in line
+
+
+def test_a_file_that_is_no_checkpoint_is_refused(tmp_path, capsys):
+    path = tmp_path / "junk.safetensors"
+    path.write_bytes(b"junk")
+    assert str(path) in fails(capsys, "video", IDS[0], "--checkpoint", str(path))
+
+
+def test_without_a_policy_the_error_tells_how_to_train(capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr(cli.resources, "files", lambda _: tmp_path)
+    line = fails(capsys, "evaluate", IDS[0])
+    assert f"ir-maniskill train {IDS[0]}" in line and str(tmp_path) in line
+
+
+def test_an_unknown_instruction_lists_those_there_are(capsys, policy_file):
+    line = fails(
+        capsys, "evaluate", IDS[1], "--checkpoint", str(policy_file),
+        "--instruction", "Touch the moon.",
+    )  # fmt: skip
+    assert "'Touch the moon.'" in line and "'Touch the red cube.'" in line
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["evaluate", IDS[0], "--num-envs", "0"], "--num-envs: got 0"),
+        (["evaluate", IDS[0], "--episodes", "0"], "--episodes: got 0"),
+        (["video", IDS[0], "--episodes", "-1"], "--episodes: got -1"),
+        (["video", IDS[0], "--speed", "0"], "speed: got 0"),
+        (["video", IDS[0], "--out", "film.avi"], "film.avi"),
+        (["train", IDS[0], "--num-envs", "7"], "num_envs: got 7"),
+        (["train", IDS[0], "--preset", "fast"], "default, paper"),
+        (["curve", "/nowhere"], "/nowhere"),
+    ],
+)
+def test_values_out_of_range_are_refused(arguments, message, capsys, policy_file):
+    if arguments[0] in ("evaluate", "video"):
+        arguments = [*arguments, "--checkpoint", str(policy_file)]
+    assert message in fails(capsys, *arguments)
+
+
+@pytest.mark.parametrize("arguments", [[], ["dance"], ["train"], ["evaluate"]])
+def test_incomplete_commands_exit_with_2(arguments, capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.run(arguments)
+    assert stop.value.code == 2
+
+
+def trained_with(monkeypatch, *arguments):
+    """Return the config and the resume flag that a train command leads to."""
+    calls = []
+    monkeypatch.setattr(
+        cli, "train", lambda config, resume: calls.append((config, resume))
+    )
+    assert cli.run(["train", *arguments]) == 0
+    return calls[0]
+
+
+@pytest.mark.parametrize("preset", ["default", "paper"])
+def test_a_preset_gives_every_number_but_id_and_folder(preset, monkeypatch):
+    config, resume = trained_with(monkeypatch, IDS[2], "--preset", preset)
+    out = f"runs/{IDS[2]}"
+    assert config == dataclasses.replace(CONFIGS[preset], env_id=IDS[2], out=out)
+    assert type(config) is TrainConfig and resume is False
+
+
+def test_options_override_the_preset(monkeypatch):
+    config, resume = trained_with(
+        monkeypatch, IDS[0], "--preset", "paper", "--ppo.learning-rate", "0.001",
+        "--agent.senses", "vision", "touch", "--out", "runs/mine", "--resume",
+    )  # fmt: skip
+    assert config.ppo.learning_rate == 0.001
+    assert config.agent.senses == ("vision", "touch")
+    assert config.out == "runs/mine" and resume is True
+    assert config.ppo.clip == CONFIGS["paper"].ppo.clip
+
+
+def test_errors_of_many_lines_are_told_in_one(monkeypatch, capsys):
+    def fail(*_, **__):
+        raise RuntimeError("worker 1 failed:\nTraceback ...\n  File\nKeyError: 'x'")
+
+    monkeypatch.setattr(cli, "train", fail)
+    line = fails(capsys, "train", IDS[0])
+    assert "worker 1 failed: KeyError: 'x'" in line
+
+
+def test_ctrl_c_exits_with_130(monkeypatch):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "train", interrupt)
+    assert cli.run(["train", IDS[0]]) == 130
+
+
+@pytest.mark.render
+def test_evaluate_prints_a_table_and_writes_json(
+    policy_file, multi_vec, monkeypatch, tmp_path, capsys
+):
+    monkeypatch.setattr(evaluate, "make_vec", lambda *_, **__: multi_vec)
+    monkeypatch.setattr(multi_vec, "close", lambda: None)
+    out, task = tmp_path / "report.json", "NaoTouchCubeMulti-v1"
+    options = ["--episodes", "3", "--seed", "5", "--json", str(out)]
+    assert cli.run(["evaluate", task, "--checkpoint", str(policy_file), *options]) == 0
+    assert "Touch the blue cube." in capsys.readouterr().out
+    data = json.loads(out.read_text())
+    assert data["episodes"] == 3 and data["seed"] == 5 and data["trained_steps"] == 7
+    assert data["config"]["camera_height"] == 64
+    assert list(data["instructions"]) == list(experiment.get(task).sentences)

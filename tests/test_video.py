@@ -1,0 +1,154 @@
+from pathlib import Path
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+
+from ir_maniskill.training import plots, video
+from ir_maniskill.training.evaluate import evaluate_policy
+from ir_maniskill.training.video import RIGHT, SIZE, WRONG, Snapshot, draw, write_video
+
+
+def snapshot(step=3, right=(), wrong=(), history=((False, False),) * 3):
+    gray = np.full((540, 836, 3), 127, np.uint8)
+    picture = np.full((64, 32, 3), 200, np.uint8)
+    return Snapshot(
+        view=gray,
+        cameras=(picture, picture),
+        instruction="Touch the blue cube.",
+        right=tuple(finger in right for finger in range(6)),
+        wrong=tuple(finger in wrong for finger in range(6)),
+        step=step,
+        total_steps=4,
+        score=1.5,
+        history=history,
+    )
+
+
+def share(frame, box, color):
+    """Return the share of a box that has a color."""
+    x, y, width, height = box
+    return (frame[y : y + height, x : x + width] == color).all(axis=-1).mean()
+
+
+def light(finger):
+    """Return the middle of a finger's light, a few pixels wide."""
+    x, y, *_ = video.HANDS
+    return (x + 112 + 88 * (finger % 3), y + 22 + 56 * (finger // 3), 4, 4)
+
+
+def test_a_frame_has_the_promised_size():
+    frame = draw(snapshot())
+    assert frame.shape == (720, 1280, 3) and frame.dtype == np.uint8
+    assert (frame.shape[1], frame.shape[0]) == SIZE
+
+
+@pytest.mark.parametrize("finger", range(6))
+def test_a_touching_finger_lights_its_own_lamp_only(finger):
+    for color, frame in (
+        (RIGHT, draw(snapshot(right=[finger]))),
+        (WRONG, draw(snapshot(wrong=[finger]))),
+    ):
+        lit = [share(frame, light(other), color) == 1 for other in range(6)]
+        assert lit == [other == finger for other in range(6)]
+
+
+def test_the_timeline_shows_what_each_step_touched():
+    history = ((True, False), (False, True), (True, True))
+    frame = draw(snapshot(history=history))
+    # One cell is all green, one all red, one half and half; the fourth is to come.
+    assert share(frame, video.TIMELINE, RIGHT) == pytest.approx(1.5 / 4, abs=0.02)
+    assert share(frame, video.TIMELINE, WRONG) == pytest.approx(1.5 / 4, abs=0.02)
+
+
+def test_the_view_and_the_pictures_are_shown():
+    frame = draw(snapshot())
+    assert share(frame, video.VIEW, (127, 127, 127)) > 0.99
+    for box in video.CAMERAS:
+        assert share(frame, box, (200, 200, 200)) > 0.98
+
+
+def test_a_policy_without_pictures_can_be_shown():
+    blind = draw(Snapshot(**{**vars(snapshot()), "cameras": ()}))
+    assert share(blind, video.CAMERAS[0], video.PAGE) == 1
+
+
+@pytest.mark.parametrize("name, size", [("a.mp4", (1280, 720)), ("a.gif", (640, 360))])
+def test_videos_play_and_hold_their_last_frame(name, size, tmp_path):
+    path = tmp_path / "new" / name
+    shots = [snapshot(step=step, right=[step]) for step in range(5)]
+    assert write_video(path, iter(shots), speed=0.5, hold=0.5) == 5
+    reader = imageio.get_reader(path)
+    frames = [np.asarray(frame) for frame in reader]
+    assert {(f.shape[1], f.shape[0]) for f in frames} == {size}
+    # GIF merges equal frames into one that lasts longer.
+    assert len(frames) == (5 + 5 if name.endswith("mp4") else 5)
+    assert not np.array_equal(frames[0], frames[4])
+
+
+def test_mp4_uses_the_colors_every_player_knows(tmp_path):
+    path = tmp_path / "a.mp4"
+    write_video(path, [snapshot()])
+    facts = imageio.get_reader(path).get_meta_data()
+    assert facts["codec"] == "h264" and facts["pix_fmt"].startswith("yuv420p")
+    assert facts["fps"] == 10
+
+
+def test_other_names_and_empty_videos_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"got .*a.avi, expected"):
+        write_video(tmp_path / "a.avi", [snapshot()])
+    with pytest.raises(ValueError, match="at least one"):
+        write_video(tmp_path / "a.gif", [])
+
+
+@pytest.mark.slow
+@pytest.mark.render
+def test_the_video_shows_the_evaluated_episode(multi_vec, reflex, env_kwargs):
+    env_id, seed = "NaoTouchCubeMulti-v1", 20
+    shots = list(
+        video.record(
+            reflex,
+            env_id,
+            episodes=1,
+            seed=seed,
+            instructions=[1],
+            env_kwargs=env_kwargs,
+        )
+    )
+    report = evaluate_policy(
+        reflex, env_id, episodes=1, seed=seed, instructions=[1], envs=multi_vec
+    )
+    assert [shot.step for shot in shots] == list(range(33))
+    assert {shot.instruction for shot in shots} == {"Touch the red cube."}
+    assert shots[-1].score == pytest.approx(report.overall.mean_return)
+    seen = shots[1:]
+    assert sum(sum(s.right) for s in seen) == round(32 * report.overall.right_fingers)
+    touched = [right for right, _ in shots[-1].history]
+    assert np.mean(touched) == pytest.approx(report.overall.touching)
+    assert all(shot.view.std() > 20 and shot.cameras[0].std() > 20 for shot in shots)
+
+
+def write_metrics(folder: Path, name: str, rows: list[dict]) -> None:
+    lines = [",".join(rows[0])] + [",".join(map(str, row.values())) for row in rows]
+    (folder / name).write_text("\n".join(lines) + "\n")
+
+
+def test_learning_curve_draws_a_run(tmp_path):
+    rows = [
+        {"steps": 2048 * i, "train/return": i, "train/success": i / 9}
+        for i in range(10)
+    ]
+    write_metrics(tmp_path, "metrics.csv", rows)
+    path = plots.learning_curve(tmp_path)
+    plain = imageio.imread(path)
+    assert path == tmp_path / "learning_curve.png" and plain.shape[1] == 1200
+    write_metrics(tmp_path, "evaluations.csv", [{"steps": 4096, "eval/success": 0.5}])
+    assert not np.array_equal(imageio.imread(plots.learning_curve(tmp_path)), plain)
+
+
+def test_learning_curve_of_no_run_or_a_broken_one_says_so(tmp_path):
+    with pytest.raises(plots.PlotError, match=r"no metrics.csv"):
+        plots.learning_curve(tmp_path)
+    (tmp_path / "metrics.csv").write_text("steps,train/return\n1,many\n")
+    with pytest.raises(plots.PlotError, match="expected a table of numbers"):
+        plots.learning_curve(tmp_path)
