@@ -13,7 +13,7 @@ import json
 import math
 import os
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -232,7 +232,7 @@ def evaluate_policy(
         scope: contextlib.AbstractContextManager[Any] = contextlib.closing(envs)
     else:
         scope = contextlib.nullcontext(envs)
-    with scope:
+    with scope, _one_thread():
         sentences = tuple(envs.experiment.sentences)
         chosen = _choose_instructions(sentences, instructions, episodes)
         told = torch.tensor([chosen[e % len(chosen)] for e in range(episodes)])  # [E]
@@ -322,6 +322,17 @@ def _play(
             playing &= ~done.cpu()
             state = stack.push(obs, done)
     return record
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Leaves the cores to the simulator: a policy acting alone is too small to share."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def pinned(instruction: Tensor | int) -> dict[str, Any]:
