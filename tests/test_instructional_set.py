@@ -1,0 +1,60 @@
+"""Sentences become the tokens of the paper's vocabulary."""
+
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ir_maniskill import experiment as catalog
+from ir_maniskill.environment.instructional_set import (
+    PAD,
+    UNK,
+    InstructionalSet,
+    tokenize,
+)
+from ir_maniskill.experiment import VOCABULARY, Experiment, Instruction, TouchObject
+
+CPU = torch.device("cpu")
+
+
+def test_the_vocabulary_has_the_papers_size() -> None:
+    assert len(VOCABULARY) == len(set(VOCABULARY)) == 10
+
+
+def test_the_papers_sentence_has_five_tokens() -> None:
+    assert tokenize("Touch the blue cube.") == [3, 4, 5, 8, 2]
+
+
+def test_unknown_words_become_unk_and_case_does_not_matter() -> None:
+    assert tokenize("TOUCH the purple, cube") == [3, 4, UNK, 8]
+
+
+@given(st.text())
+def test_any_text_gives_known_ids_and_never_padding(text: str) -> None:
+    ids = tokenize(text)
+    assert all(0 < token < len(VOCABULARY) for token in ids)
+
+
+@given(st.lists(st.sampled_from(VOCABULARY[2:])))
+def test_tokens_name_their_words(words: list[str]) -> None:
+    assert [VOCABULARY[t] for t in tokenize(" ".join(words))] == words
+
+
+def test_shorter_sentences_are_padded_and_targets_are_found() -> None:
+    blue, red = TouchObject("blue", (0.2, 0.0)), TouchObject("red", (0.2, 0.1))
+    both = Experiment(
+        "Pad-v1",
+        (blue, red),
+        (
+            Instruction("Touch the red cube.", "red cube"),
+            Instruction("Blue", blue.name),
+        ),
+    )
+    instructions = InstructionalSet(both, CPU)
+    assert instructions.tokens.tolist() == [[3, 4, 6, 8, 2], [5, PAD, PAD, PAD, PAD]]
+    assert instructions.targets.tolist() == [1, 0]
+
+
+def test_uniform_numbers_pick_every_instruction_equally() -> None:
+    instructions = InstructionalSet(catalog.get("NaoTouchCubeMulti-v1"), CPU)
+    picks = instructions.pick(torch.tensor([0.0, 0.33, 0.34, 0.66, 0.67, 1.0]))
+    assert picks.tolist() == [0, 0, 1, 1, 2, 2]

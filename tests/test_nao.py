@@ -1,0 +1,151 @@
+"""The robot as ManiSkill drives it: order, limits, modes, senses, stability."""
+
+import math
+from collections.abc import Iterator
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+from ir_maniskill.environment.robot.nao import FINGERS, JOINTS
+from ir_maniskill.environment.touch_env import TouchEnv
+
+ABSOLUTE, DELTA = "pd_joint_pos", "pd_joint_target_delta_pos"
+TWO_DEGREES = math.radians(2)
+
+
+@pytest.fixture(scope="module", params=[ABSOLUTE, DELTA])
+def env(request: pytest.FixtureRequest) -> Iterator[TouchEnv]:
+    """A button task without pictures in either control mode."""
+    env = gym.make(
+        "NaoTouchButtonTriangle-v1",
+        obs_mode="state_dict",
+        control_mode=request.param,
+        render_backend="none",
+    )
+    yield env.unwrapped
+    env.close()
+
+
+def action(env: TouchEnv, **joints: float) -> np.ndarray:
+    """Return an action that is 0 but for the named joints."""
+    row = np.zeros(26, np.float32)
+    for name, value in joints.items():
+        row[JOINTS.index(name)] = value
+    return row
+
+
+def test_actions_are_26_joints_all_left_then_all_right(env: TouchEnv) -> None:
+    assert env.action_space.shape == (26,)
+    assert (env.action_space.low == -1).all()
+    assert (env.action_space.high == 1).all()
+    assert JOINTS[:5] == tuple(
+        "L" + j
+        for j in ("ShoulderPitch", "ShoulderRoll", "ElbowYaw", "ElbowRoll", "WristYaw")
+    )
+    assert JOINTS[13:] == tuple("R" + joint[1:] for joint in JOINTS[:13])
+
+
+@pytest.mark.parametrize("joint", ["LShoulderRoll", "RElbowRoll", "LThumb2"])
+def test_an_action_moves_the_joint_it_names_and_no_other(
+    env: TouchEnv, joint: str
+) -> None:
+    obs, _ = env.reset(seed=3)
+    before = obs["agent"]["proprioception"][0]
+    for _ in range(6):
+        still = before.numpy() if env.control_mode == ABSOLUTE else np.zeros(26)
+        move = still.astype(np.float32).copy()
+        move[JOINTS.index(joint)] += 0.4
+        obs = env.step(move)[0]
+    change = (obs["agent"]["proprioception"][0] - before).abs()
+    assert change.argmax().item() == JOINTS.index(joint)
+    assert change.max() > 0.2
+    change[JOINTS.index(joint)] = 0
+    assert change.max() < 0.1
+    qpos = env.agent.robot.get_qpos()[0]
+    names = [active.name for active in env.agent.robot.active_joints]
+    low, high = env.agent.robot.get_qlimits()[0][names.index(joint)]
+    expected = 2 * (qpos[names.index(joint)] - low) / (high - low) - 1
+    felt = obs["agent"]["proprioception"][0, JOINTS.index(joint)]
+    assert felt.item() == pytest.approx(expected.item(), abs=1e-5)
+
+
+def test_proprioception_is_within_bounds_even_at_the_limits(env: TouchEnv) -> None:
+    env.reset(seed=0)
+    for sign in (1, -1):
+        for _ in range(20):
+            obs = env.step(np.full(26, sign, np.float32))[0]
+        for felt in ("proprioception", "target"):
+            assert obs["agent"][felt].abs().max() <= 1
+        assert (obs["agent"]["target"] * sign).min() > 0.999
+
+
+def test_delta_targets_do_not_wind_up() -> None:
+    with gym.make(
+        "NaoTouchButtonTriangle-v1",
+        obs_mode="state_dict",
+        control_mode=DELTA,
+        render_backend="none",
+    ) as made:
+        env = made.unwrapped
+        env.reset(seed=0)
+        up = action(env, LWristYaw=1)
+        for _ in range(30):
+            env.step(up)
+        obs = env.step(-up)[0]
+        target = obs["agent"]["target"][0, JOINTS.index("LWristYaw")]
+        assert target.item() == pytest.approx(1 - 0.15, abs=1e-5)
+
+
+def test_drives_have_the_real_motors_limits(env: TouchEnv) -> None:
+    joint = env.agent.robot.joints_map["LShoulderPitch"]._objs[0]
+    assert joint.get_force_limit() == pytest.approx(1.329)
+    assert joint.get_max_velocity() == pytest.approx(8.26797)
+    assert joint.get_armature()[0] == pytest.approx(1e-2)
+    finger = env.agent.robot.joints_map["RFinger13"]._objs[0]
+    assert finger.get_armature()[0] == pytest.approx(1e-3)
+
+
+def test_keyframes_are_poses_the_robot_can_take(env: TouchEnv) -> None:
+    assert set(env.agent.keyframes) == {"rest", "hands_over_table"}
+    low, high = env.agent.robot.get_qlimits()[0].T
+    for keyframe in env.agent.keyframes.values():
+        qpos = torch.as_tensor(keyframe.qpos)
+        assert ((qpos >= low) & (qpos <= high)).all()
+    env.reset(seed=0)
+    env.agent.robot.set_qpos(torch.as_tensor(env.agent.keyframes["rest"].qpos)[None])
+    assert env.agent.finger_position()[0, :, 2].max() < 0.0  # below the table top
+
+
+def test_six_fingers_have_their_links_in_the_order_of_the_bits(env: TouchEnv) -> None:
+    links = [[link.name for link in finger] for finger in env.agent.finger_links]
+    assert [len(finger) for finger in links] == [3, 3, 2, 3, 3, 2]
+    for name, finger in zip(FINGERS, links, strict=True):
+        assert all(link.startswith(name) for link in finger)
+        assert finger == sorted(finger)
+
+
+def test_fingers_are_still_at_rest(env: TouchEnv) -> None:
+    obs, _ = env.reset(seed=0)
+    hold = obs["agent"]["target"][0].numpy()
+    hold = hold if env.control_mode == ABSOLUTE else np.zeros(26, np.float32)
+    for _ in range(20):
+        env.step(hold)
+    speeds = [env.step(hold)[0]["agent"]["velocity"].abs().max() for _ in range(20)]
+    assert max(speeds) < 0.02  # [rad/s]
+
+
+@pytest.mark.slow
+def test_ten_thousand_random_steps_break_no_limit(env: TouchEnv) -> None:
+    random = np.random.default_rng(0)
+    low, high = env.agent.robot.get_qlimits()[0].T
+    worst = 0.0
+    for step in range(10_000):
+        if step % 32 == 0:
+            env.reset()
+        env.step(random.uniform(-1, 1, 26).astype(np.float32))
+        qpos = env.agent.robot.get_qpos()[0]
+        assert qpos.isfinite().all()
+        worst = max(worst, (low - qpos).max().item(), (qpos - high).max().item())
+    assert worst < TWO_DEGREES

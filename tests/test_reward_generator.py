@@ -1,0 +1,92 @@
+"""The paper's rewards, by hand, without a simulator."""
+
+import dataclasses
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ir_maniskill import experiment as catalog
+from ir_maniskill.environment.reward_generator import (
+    DenseWeights,
+    FingerCount,
+    count_fingers,
+    dense_reward,
+    highest_reward,
+    sparse_reward,
+)
+
+LINE = catalog.get("NaoTouchCubeMulti-v1")
+TRIANGLE = catalog.get("NaoTouchCubeTriangle-v1")
+
+
+def contact(*touching: tuple[int, int]) -> torch.Tensor:
+    """Return contacts [1, 6, 3] with the given (finger, object) pairs on."""
+    table = torch.zeros(1, 6, 3, dtype=torch.bool)
+    for finger, thing in touching:
+        table[0, finger, thing] = True
+    return table
+
+
+@pytest.mark.parametrize(
+    ("touching", "binary", "per_finger"),
+    [
+        ([], 0.0, 0.0),
+        ([(0, 1)], 1.0, 1.0),
+        ([(0, 1), (1, 1), (2, 1)], 1.0, 3.0),
+        ([(0, 0)], 0.0, -0.1),
+        ([(0, 0), (0, 2)], 0.0, -0.1),  # one finger on two wrong objects
+        ([(0, 0), (1, 2)], 0.0, -0.2),
+        ([(0, 0), (0, 1)], 1.0, 0.9),  # one finger on both
+        ([(f, 1) for f in range(6)], 1.0, 6.0),
+    ],
+)
+def test_the_papers_rewards(
+    touching: list[tuple[int, int]], binary: float, per_finger: float
+) -> None:
+    count = count_fingers(contact(*touching), torch.tensor([1]))
+    assert sparse_reward(LINE, count).item() == pytest.approx(binary)
+    assert sparse_reward(TRIANGLE, count).item() == pytest.approx(per_finger)
+
+
+def test_each_env_is_counted_by_its_own_sentence() -> None:
+    contacts = contact((3, 0), (4, 0), (5, 2)).repeat(3, 1, 1)
+    count = count_fingers(contacts, torch.tensor([0, 1, 2]))
+    assert count.right.tolist() == [2, 0, 1]
+    assert count.wrong.tolist() == [1, 3, 2]
+
+
+@given(st.integers(1, 5), st.integers(1, 6), st.integers(1, 4), st.integers(0, 2**31))
+def test_counts_are_within_bounds(n: int, f: int, c: int, seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    contacts = torch.rand(n, f, c, generator=generator) < 0.5
+    target = torch.randint(c, (n,), generator=generator)
+    count = count_fingers(contacts, target)
+    rows = torch.arange(n)
+    assert (count.right == contacts[rows, :, target].sum(1)).all()
+    assert ((count.wrong >= 0) & (count.wrong <= f)).all()
+    assert (count.right + count.wrong >= contacts.any(2).sum(1)).all()
+
+
+def test_dense_reward_adds_reaching_and_takes_wrong_touches() -> None:
+    weights = DenseWeights(reach=0.5, reach_scale=0.1, wrong=0.3)
+    count = FingerCount(torch.tensor([0, 0, 1]), torch.tensor([0, 2, 0]))
+    distance = torch.tensor([[0.1, 0.3], [0.3, 0.0], [0.0, 0.0]])
+    reward = dense_reward(LINE, count, distance, weights)
+    at_scale = 0.5 * (1 - 0.7615942)
+    assert reward.tolist() == pytest.approx([at_scale, 0.5 - 0.3, 1.5])
+
+
+def test_highest_reward_bounds_the_dense_one() -> None:
+    weights = DenseWeights()
+    all_fingers = FingerCount(torch.tensor([6]), torch.tensor([0]))
+    for experiment in (LINE, TRIANGLE):
+        best = dense_reward(experiment, all_fingers, torch.zeros(1, 6), weights)
+        assert best.item() == pytest.approx(highest_reward(experiment, 6, weights))
+
+
+def test_a_penalty_in_the_line_is_a_field_of_the_experiment() -> None:
+    stern = dataclasses.replace(LINE, id="Stern-v1", wrong_penalty=0.5)
+    count = FingerCount(torch.tensor([4]), torch.tensor([2]))
+    assert sparse_reward(stern, count).item() == pytest.approx(0.0)
