@@ -164,7 +164,7 @@ def parse(arguments: Sequence[str]) -> Any:
         | Annotated[Curve, subcommand("curve")]
         | Annotated[Doctor, subcommand("doctor")]
     )
-    return tyro.cli(  # type: ignore[call-overload]
+    return tyro.cli(
         commands, args=list(arguments), prog="ir-maniskill", description=_DESCRIPTION
     )
 
@@ -182,7 +182,7 @@ def _tasks(_: Tasks) -> int:
     return 0
 
 
-def _describe(experiment: Experiment) -> tuple[str, ...]:
+def _describe(experiment: Experiment) -> tuple[str, str, str, str, str]:
     """Returns the row of an experiment in the table of tasks."""
     sentences = experiment.sentences
     more = f" (+{len(sentences) - 1})" if len(sentences) > 1 else ""

@@ -232,7 +232,7 @@ def evaluate_policy(
         scope: contextlib.AbstractContextManager[Any] = contextlib.closing(envs)
     else:
         scope = contextlib.nullcontext(envs)
-    with scope, _one_thread():
+    with scope, one_thread():
         sentences = tuple(envs.experiment.sentences)
         chosen = _choose_instructions(sentences, instructions, episodes)
         told = torch.tensor([chosen[e % len(chosen)] for e in range(episodes)])  # [E]
@@ -325,8 +325,8 @@ def _play(
 
 
 @contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Leaves the cores to the simulator: a policy acting alone is too small to share."""
+def one_thread() -> Iterator[None]:
+    """Leaves the cores to the simulator: one row of a policy is too little to share."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

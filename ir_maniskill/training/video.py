@@ -21,7 +21,7 @@ from mani_skill.utils.sapien_utils import look_at
 from PIL import Image, ImageDraw, ImageFont
 
 from ir_maniskill.environment.state import StateStack
-from ir_maniskill.training.evaluate import Policy, pinned
+from ir_maniskill.training.evaluate import Policy, one_thread, pinned
 
 Box = tuple[int, int, int, int]
 """Left, top, width and height [pixel]."""
@@ -162,7 +162,8 @@ def _play(
     base: Any = env.unwrapped
     state, total = stack.reset(obs), base.experiment.episode_steps
     right = wrong = (False,) * (2 * len(FINGERS))
-    score, history = 0.0, ()
+    score = 0.0
+    history: tuple[tuple[bool, bool], ...] = ()
     for step in range(total + 1):
         yield Snapshot(
             view=stage.show(base.get_state_dict()),
@@ -176,7 +177,9 @@ def _play(
             history=history,
         )
         if step < total:
-            obs, reward, _, _, info = env.step(policy(state))
+            with one_thread():
+                action = policy(state)
+            obs, reward, _, _, info = env.step(action)
             state, score = stack.push(obs), score + float(reward)
             right, wrong = _touching(info["contact"][0], int(base.target_index[0]))
             history += ((any(right), any(wrong)),)
@@ -318,11 +321,16 @@ def _draw_hands(page: Image.Image, snapshot: Snapshot) -> None:
             if snapshot.wrong[index]:
                 color = WRONG
             if color != EDGE:
-                glow = tuple((c + 2 * d) // 3 for c, d in zip(color, CARD, strict=True))
-                _paste_shape(page, (left + 14, top - 5, 32, 32), glow, 16)
+                _paste_shape(page, (left + 14, top - 5, 32, 32), _dim(color), 16)
             _paste_shape(page, (left + 20, top + 1, 20, 20), color, 10)
             ink = INK if color != EDGE else FAINT
             canvas.text((left + 30, top + 29), name, ink, _font(12), anchor="mt")
+
+
+def _dim(color: Color) -> Color:
+    """Mixes a color into the card's, for the glow around a light."""
+    red, green, blue = ((c + 2 * d) // 3 for c, d in zip(color, CARD, strict=True))
+    return red, green, blue
 
 
 def _draw_counters(canvas: ImageDraw.ImageDraw, snapshot: Snapshot) -> None:
@@ -388,11 +396,17 @@ def check_name(path: Path) -> None:
 
 def _write_mp4(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
     """H.264 with 4:2:0 colors, which every player knows."""
-    options = {"codec": "libx264", "pixelformat": "yuv420p", "quality": None}
     tuning = ["-crf", "20", "-preset", "medium", "-movflags", "+faststart"]
-    with imageio.get_writer(
-        path, format="FFMPEG", fps=rate, output_params=tuning, **options
-    ) as writer:
+    options: dict[str, Any] = {"pixelformat": "yuv420p", "quality": None}
+    writer: Any = imageio.get_writer(
+        path,
+        format="FFMPEG",
+        fps=rate,
+        codec="libx264",
+        output_params=tuning,
+        **options,
+    )
+    with writer:
         for frame in frames:
             writer.append_data(frame)
 
