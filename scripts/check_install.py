@@ -47,7 +47,7 @@ def check_step(env: gym.Env) -> None:
         assert float(picture.float().std()) > 1, f"{camera} sees nothing"
     _, reward, *_, info = env.step(env.action_space.sample())
     assert reward.shape == (1,) and "success" in info
-    assert "touch the" in env.unwrapped.get_language_instruction()[0]
+    assert "Touch the" in env.unwrapped.get_language_instruction()[0]
 
 
 if __name__ == "__main__":
