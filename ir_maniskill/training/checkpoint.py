@@ -106,8 +106,9 @@ def read(path: Path) -> Stored:
         MemoryError,
     ) as error:
         raise CheckpointError(
-            f"{path}: got a file that is cut short, altered or not ours ({_brief(error)}); "
-            f"expected {CHECKPOINT!r} or {POLICY!r}: restore it, or train anew"
+            f"{path}: got a file that is cut short, altered or not ours "
+            f"({_brief(error)}); expected {CHECKPOINT!r} or {POLICY!r}: restore it, or "
+            "train anew"
         ) from error
 
 
@@ -197,8 +198,8 @@ def load_policy(path: Path | str) -> tuple[Agent, TrainConfig, dict[str, Any]]:
         )
     except (ConfigError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise CheckpointError(
-            f"{path}: its weights and its config do not belong together ({_brief(error)}); "
-            "expected a file written by this version of ir_maniskill"
+            f"{path}: its weights and its config do not belong together "
+            f"({_brief(error)}); expected a file of this version of ir_maniskill"
         ) from error
     agent.eval()
     return agent, config, stored.metadata

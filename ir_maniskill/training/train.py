@@ -54,6 +54,7 @@ def train(
     folder = RunFolder(Path(config.out), resume=resume)
     with contextlib.ExitStack() as leaving:
         leaving.callback(folder.close)
+        leaving.callback(torch.set_num_threads, torch.get_num_threads())
         if envs is None:
             envs = _make_envs(config)
             leaving.callback(envs.close)
@@ -90,6 +91,7 @@ class Trainer:
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self.stack = StateStack(config.frames)
         torch.manual_seed(config.seed)
+        torch.set_num_threads(1)  # orthogonal weights depend on it in their last bits
         self.steps, self.best_score = 0, -math.inf
         self.reward_scale = RewardScale(config.num_envs, config.ppo.gamma)
         self.state = self._fresh_scenes()
