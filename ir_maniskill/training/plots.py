@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 TRAINING = (
-    ("train/success", "Episodes with a touch of the named object"),
-    ("train/exclusive", "... and of no other"),
-    ("train/touching", "Steps touching it"),
+    ("train/success", "episodes touching the named object"),
+    ("train/exclusive", "and nothing else"),
+    ("train/touching", "steps touching it"),
 )
 """Columns of metrics.csv that are shares, and what the legend calls them."""
 COLORS = ("#2f6fde", "#22a06b", "#9aa3b2")
@@ -28,7 +28,8 @@ class PlotError(ValueError):
 def learning_curve(run: Path, out: Path | None = None) -> Path:
     """Draws success, touch and return over the steps of a run.
 
-    Lines are the noisy policy while training, dots its evaluations without noise.
+    Lines are the exploring policy, dots its evaluations without noise; "it" is the
+    object that the sentence names.
 
     Args:
         run: Folder of the run, with metrics.csv and, after the first evaluation,
@@ -80,9 +81,17 @@ def _draw_shares(
             axes.plot(*zip(*points, strict=True), "o", color=color, markersize=6)
     axes.set_ylim(-3, 103)
     axes.set_ylabel("Share [%]")
-    axes.legend(frameon=False, loc="lower right", labelcolor=INK)
-    title = "lines: while exploring   dots: evaluated without noise"
-    axes.set_title(title, loc="left", fontsize=9, color=INK)
+    axes.plot([], [], "o", color=INK, markersize=6, label="evaluated without noise")
+    axes.legend(
+        loc="lower left",
+        bbox_to_anchor=(-0.01, 1.0),
+        ncols=len(TRAINING) + 1,
+        frameon=False,
+        fontsize=8.5,
+        labelcolor=INK,
+        handlelength=1.2,
+        columnspacing=1.1,
+    )
 
 
 def _draw_lines(
