@@ -140,7 +140,7 @@ def test_whatever_is_accepted_can_be_reached_and_does_not_overlap(
         return
     for i, a in enumerate(made.objects):
         x, y = a.position
-        assert 0.10 <= x - 0.02 - jitter
+        assert x - 0.02 - jitter >= 0.10
         assert x + 0.02 + jitter <= 0.40
         nearest = min((x**2 + (y - s) ** 2) ** 0.5 for s in (0.098, -0.098))
         assert nearest <= 0.255 + 1e-6

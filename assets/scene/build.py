@@ -18,7 +18,7 @@ TABLE_X, TABLE_Y, TABLE_Z = (0.10, 0.40), (-0.34, 0.34), (0.01, 0.03)
 """Extents of the table top [m]."""
 LEG_WIDTH = 0.03
 """Edge of a table leg [m]."""
-ROOM_X, ROOM_Y, ROOM_HEIGHT = (-0.8, 1.2), (-2.4, 2.4), 1.6
+ROOM_X, ROOM_Y, ROOM_HEIGHT = (-0.8, 1.2), (-3.2, 3.2), 1.8
 """Extents of the floor, and height of the wall behind the robot [m]."""
 SKIRTING_HEIGHT = 0.05
 """Height of the skirting board [m]."""
@@ -50,7 +50,7 @@ def box(*extents: tuple[float, float], color: int) -> Surface:
     mesh = trimesh.creation.box(high - low)
     side = np.argmax(mesh.face_normals @ np.vstack([np.eye(3), -np.eye(3)]).T, axis=1)
     vertices = mesh.vertices + (low + high) / 2
-    return Surface(vertices, mesh.faces, np.full(len(mesh.faces), color), side)
+    return Surface(vertices, mesh.faces, np.full(len(mesh.faces), color), side, side)
 
 
 def room() -> Surface:
@@ -74,7 +74,9 @@ def room() -> Surface:
 
 def button() -> trimesh.Trimesh:
     """Return a round button that stands upright; its color is given at load."""
-    surface = knob(0, BUTTON_PROFILE, BUTTON_SEGMENTS).turned(0, -np.pi / 2, 0)
+    surface = knob([0] * len(BUTTON_PROFILE), BUTTON_PROFILE, BUTTON_SEGMENTS).turned(
+        0, -np.pi / 2, 0
+    )
     mesh = bake(surface, ((255, 255, 255),), _LIGHT)
     return trimesh.Trimesh(
         mesh.vertices, mesh.faces, vertex_normals=mesh.vertex_normals, process=False

@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.shared_memory import SharedMemory
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -30,6 +30,9 @@ from ir_maniskill.experiment import Experiment
 
 Tree = dict[str, Any]
 """Nested dicts with tensors or arrays as leaves."""
+
+Step = tuple[Tree, Tensor, Tensor, Tensor, Tree]
+"""Observation, reward [N], terminated [N], truncated [N], info."""
 
 
 class WorkerError(RuntimeError):
@@ -123,8 +126,8 @@ class ProcessVectorEnv(VectorEnv):
     as always with processes that are not forked.
     """
 
-    metadata: ClassVar[dict] = {"autoreset_mode": AutoresetMode.SAME_STEP}
     device = torch.device("cpu")
+    _shared: _SharedTree
 
     def __init__(
         self,
@@ -148,11 +151,11 @@ class ProcessVectorEnv(VectorEnv):
         Raises:
             WorkerError: A worker could not make its envs.
         """
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
         cores = len(os.sched_getaffinity(0))
         workers = min(num_envs, num_workers or cores)
         self.experiment, self.num_envs, self._timeout = experiment, num_envs, timeout
         self._rows = [list(r) for r in np.array_split(np.arange(num_envs), workers)]
-        self._shared: _SharedTree | None = None
         self._pipes: list[Connection] = []
         self._processes: list[mp.process.BaseProcess] = []
         context = mp.get_context("forkserver")
@@ -212,7 +215,7 @@ class ProcessVectorEnv(VectorEnv):
         )
         return self._shared.read("obs"), self._shared.read("info")
 
-    def step(self, actions: Tensor | np.ndarray) -> tuple[Tree, Tensor, ...]:
+    def step(self, actions: Tensor | np.ndarray) -> Step:
         """Step every env and reset those that are done.
 
         Args:
@@ -227,13 +230,13 @@ class ProcessVectorEnv(VectorEnv):
     def step_async(self, actions: Tensor | np.ndarray) -> None:
         """Send the actions and return at once; `step_wait` must follow."""
         actions = np.asarray(actions, dtype=np.float32)
-        expected = (self.num_envs, *self.single_action_space.shape)
+        expected = self.action_space.shape
         if actions.shape != expected:
             raise ValueError(f"actions: got shape {actions.shape}, expected {expected}")
         self._shared.arrays["action",][:] = actions
         self._send("step", [None] * len(self._pipes))
 
-    def step_wait(self) -> tuple[Tree, Tensor, ...]:
+    def step_wait(self) -> Step:
         """Wait for all workers and return what `step` returns."""
         self._gather()
         shared = self._shared
@@ -260,9 +263,9 @@ class ProcessVectorEnv(VectorEnv):
                 process.kill()
                 process.join()
         self._pipes, self._processes = [], []
-        if self._shared is not None:
-            self._shared.close(unlink=True)
-            self._shared = None
+        shared = self.__dict__.pop("_shared", None)
+        if shared is not None:
+            shared.close(unlink=True)
 
     # -- Random streams --------------------------------------------------------------
 
@@ -300,19 +303,20 @@ class ProcessVectorEnv(VectorEnv):
     def _gather(self) -> list:
         """Collect one answer from every worker."""
         answers: list = [None] * len(self._pipes)
-        pending = {pipe: index for index, pipe in enumerate(self._pipes)}
+        pending = set(range(len(self._pipes)))
         deadline = time.monotonic() + self._timeout
         while pending:
-            ready = wait(list(pending), max(0.0, deadline - time.monotonic()))
+            left = max(0.0, deadline - time.monotonic())
+            ready = wait([self._pipes[index] for index in pending], left)
             if not ready:
-                names = ", ".join(self._describe(i) for i in pending.values())
+                names = ", ".join(self._describe(index) for index in sorted(pending))
                 raise WorkerError(
                     f"no answer within {self._timeout:.0f} s from {names}"
                 )
-            for pipe in ready:
-                index = pending.pop(pipe)
+            for index in [i for i in pending if self._pipes[i] in ready]:
+                pending.remove(index)
                 try:
-                    ok, answers[index] = pipe.recv()
+                    ok, answers[index] = self._pipes[index].recv()
                 except (EOFError, OSError):
                     raise self._died(index) from None
                 if not ok:
@@ -346,6 +350,8 @@ def _options_of(options: dict[str, Any] | None, row: int) -> dict[str, Any] | No
 class _Worker:
     """The envs of one process."""
 
+    _shared: _SharedTree
+
     def __init__(
         self, experiment: Experiment, rows: list[int], env_kwargs: dict[str, Any]
     ) -> None:
@@ -353,12 +359,11 @@ class _Worker:
 
         register(experiment)
         self._rows = rows
-        self._envs = [gym.make(experiment.id, **env_kwargs) for _ in rows]
+        self._envs: list[Any] = [gym.make(experiment.id, **env_kwargs) for _ in rows]
         # ManiSkill collects garbage whenever it rebuilds a scene, which seeded resets
         # do; what is alive now stays alive, so there is no point in looking at it.
         gc.freeze()
         self._rng: list = [None] * len(rows)
-        self._shared: _SharedTree | None = None
 
     def describe(self) -> tuple[Tree, gym.Space, gym.Space]:
         """Return a one-row sample of all that is shared, and the spaces."""
@@ -421,7 +426,7 @@ def _record(obs: Tree, info: Tree) -> Tree:
     return {"obs": {k: v for k, v in obs.items() if k != "sensor_param"}, "info": info}
 
 
-def _stream(env: gym.Env) -> np.random.RandomState:
+def _stream(env: Any) -> np.random.RandomState:
     return env.unwrapped._batched_episode_rng.rngs[0]
 
 

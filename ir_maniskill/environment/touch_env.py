@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import sapien
 import torch
@@ -121,7 +122,7 @@ class TouchEnv(BaseEnv):
         # Picture formats are global: a video camera made earlier leaves floats behind.
         sapien.render.set_picture_format("Color", "r8g8b8a8unorm")
         super()._setup_sensors(options)
-        self._sensor_params = None
+        self._sensor_params: dict | None = None
 
     def _after_reconfigure(self, options: dict) -> None:
         self.instructional_set = InstructionalSet(self.experiment, self.device)
@@ -208,6 +209,7 @@ class TouchEnv(BaseEnv):
         options = dict(options or {})
         if seed is not None and not self._sim_device.is_cuda():
             options.setdefault("reconfigure", True)
+        gym.Env.reset(self, seed=seed if isinstance(seed, int) else None)
         return super().reset(seed, options)
 
     def step(self, action: Any) -> tuple[Any, Tensor, Tensor, Tensor, dict]:
@@ -274,6 +276,13 @@ class TouchEnv(BaseEnv):
             obs["finger_position"] = self.agent.finger_position()  # [N, F, 3]
             obs["target_object"] = one_hot.float()  # [N, C]
         return obs
+
+    def _flatten_raw_obs(self, obs: Any) -> Any:
+        if self.obs_mode_struct.state:  # ManiSkill flattens leaves of one row per env
+            obs["extra"] = {
+                name: leaf.flatten(1) for name, leaf in obs["extra"].items()
+            }
+        return super()._flatten_raw_obs(obs)
 
     def _object_position(self) -> Tensor:
         return torch.stack([thing.pose.p for thing in self.objects], dim=1)

@@ -139,6 +139,8 @@ class Nao(BaseAgent):
     uid = "nao"
     urdf_path = str(files("ir_maniskill.assets") / "nao" / "nao.urdf")
     fingers = FINGERS
+    start_qpos: Tensor
+    """Start of every episode, before jitter: hands over the table [J] [rad]."""
 
     # -- Loading ---------------------------------------------------------------------
 
@@ -160,9 +162,11 @@ class Nao(BaseAgent):
         self._middle = (controller.lower + controller.upper) / 2  # [J] [rad]
         self._half_range = (controller.upper - controller.lower) / 2  # [J] [rad]
         self.keyframes = {
-            "hands_over_table": self._keyframe({}),
+            "hands_over_table": self._keyframe(HANDS_OVER_TABLE),
             "rest": self._keyframe(REST),
         }
+        start = self.keyframes["hands_over_table"].qpos
+        self.start_qpos = torch.as_tensor(start, device=self.device)
 
     def _links_of(self, finger: str) -> tuple[Link, ...]:
         names = [n for n in self.robot.links_map if n.startswith(finger)]
@@ -204,11 +208,6 @@ class Nao(BaseAgent):
         qpos[..., self._order] = position
         return qpos
 
-    @property
-    def start_qpos(self) -> Tensor:
-        """Start of every episode, before jitter: hands over the table [J] [rad]."""
-        return self.to_qpos(self._middle)
-
     def clamp_qpos(self, qpos: Tensor) -> Tensor:
         """Keep joint positions in the simulator's order within the limits [..., J]."""
         limits = self.robot.get_qlimits()[0]  # [J, 2]
@@ -240,6 +239,9 @@ class Nao(BaseAgent):
         return ((position - self._middle) / self._half_range).clamp(-1, 1)
 
 
+HANDS_OVER_TABLE = {"LShoulderPitch": -0.2, "RShoulderPitch": -0.2}
+"""Hands hovering over the objects; joints not named are at the middle [rad]."""
+
 REST = {
     "LShoulderPitch": 1.40,
     "LShoulderRoll": 0.15,
@@ -270,11 +272,10 @@ def _collision_bits(link: str) -> tuple[int, ...]:
 
 def _actuator_limits(urdf_path: str) -> tuple[dict[str, float], dict[str, float]]:
     """Read effort [N m] and velocity [rad/s] limits, which SAPIEN's loader skips."""
-    limits = {
-        joint.get("name"): joint.find("limit")
-        for joint in ElementTree.parse(urdf_path).iter("joint")
-        if joint.find("limit") is not None
-    }
-    effort = {name: float(limit.get("effort")) for name, limit in limits.items()}
-    speed = {name: float(limit.get("velocity")) for name, limit in limits.items()}
+    effort, speed = {}, {}
+    for joint in ElementTree.parse(urdf_path).iter("joint"):
+        limit = joint.find("limit")
+        if limit is not None:
+            effort[joint.attrib["name"]] = float(limit.attrib["effort"])
+            speed[joint.attrib["name"]] = float(limit.attrib["velocity"])
     return effort, speed

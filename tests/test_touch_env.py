@@ -1,0 +1,336 @@
+"""What every task must do, and what a touch is."""
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+
+import gymnasium as gym
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
+from mani_skill.utils.wrappers.record import RecordEpisode
+
+import ir_maniskill
+from ir_maniskill import experiment as catalog
+from ir_maniskill.environment.robot.nao import JOINTS
+from ir_maniskill.environment.touch_env import TouchEnv
+from ir_maniskill.experiment import Jitter
+
+IDS = ir_maniskill.available()[:8]
+DELTA = "pd_joint_target_delta_pos"
+
+
+@pytest.fixture(scope="module", params=IDS)
+def env(request: pytest.FixtureRequest, multi_env: gym.Env) -> Iterator[gym.Env]:
+    """Each task in turn, with small pictures and the simulator's state.
+
+    While `multi_env` lives, the renderer does: starting it takes seconds.
+    """
+    env = gym.make(
+        request.param,
+        obs_mode="rgb+state_dict",
+        control_mode=DELTA,
+        sensor_configs={"width": 32, "height": 64},
+    )
+    yield env
+    env.close()
+
+
+def leaves(tree: dict, path: str = "") -> dict[str, torch.Tensor]:
+    """Return all tensors of a nested dict by path."""
+    found = {}
+    for name, value in tree.items():
+        inner = isinstance(value, dict)
+        found |= leaves(value, f"{path}{name}/") if inner else {path + name: value}
+    return found
+
+
+def actions(count: int, seed: int = 0) -> np.ndarray:
+    """Return random actions [count, 26]."""
+    return np.random.default_rng(seed).uniform(-1, 1, (count, 26)).astype(np.float32)
+
+
+def trajectory(env: gym.Env, seed: int, steps: int = 12) -> list[dict]:
+    """Return all observations of an episode under fixed actions."""
+    seen = [leaves(env.reset(seed=seed)[0])]
+    return seen + [leaves(env.step(action)[0]) for action in actions(steps)]
+
+
+# -- Conformance over every task -------------------------------------------------------
+
+
+def test_observations_are_in_their_space(env: gym.Env) -> None:
+    obs, _ = env.reset(seed=1)
+    for _ in range(3):
+        assert env.unwrapped.single_observation_space.contains(numpy_of(obs))
+        obs = env.step(env.action_space.sample())[0]
+    shapes = {path: tuple(leaf.shape) for path, leaf in leaves(obs).items()}
+    assert shapes["agent/proprioception"] == shapes["agent/target"] == (1, 26)
+    assert shapes["extra/touch"] == (1, 6)
+    assert shapes["extra/instruction"] == (1, 5)
+    assert shapes["sensor_data/top_camera/rgb"] == (1, 64, 32, 3)
+    assert shapes["sensor_data/front_camera/rgb"] == (1, 64, 32, 3)
+
+
+def numpy_of(obs: dict) -> dict:
+    """Return the observation unbatched and as arrays."""
+    return {
+        key: numpy_of(value) if isinstance(value, dict) else value.numpy()[0]
+        for key, value in obs.items()
+    }
+
+
+def test_a_seed_fixes_the_trajectory_whatever_came_before(env: gym.Env) -> None:
+    first = trajectory(env, seed=7)
+    other = trajectory(env, seed=8)
+    again = trajectory(env, seed=7)
+    for a, b in zip(first, again, strict=True):
+        assert all(torch.equal(a[path], b[path]) for path in a)
+    key = "extra/object_position"
+    assert not torch.equal(first[0][key], other[0][key])
+
+
+def test_episodes_start_differently_within_the_jitter(env: gym.Env) -> None:
+    experiment = env.unwrapped.experiment
+    places = torch.tensor([thing.position for thing in experiment.objects])
+    seats, sentences, previous = set(), set(), None
+    env.reset(seed=0)
+    for _ in range(24):
+        obs = leaves(env.reset()[0])
+        position = obs["extra/object_position"][0, :, :2]
+        distance = torch.cdist(position, places, p=torch.inf)
+        assert (distance.min(dim=1).values <= experiment.jitter.position + 1e-6).all()
+        assert previous is None or not torch.equal(previous, position)
+        seats.add(tuple(distance.argmin(dim=1).tolist()))
+        sentences.add(env.unwrapped.get_language_instruction()[0])
+        previous = position
+    assert len(seats) > 3 if experiment.shuffled else seats == {(0, 1, 2)}
+    assert sentences == set(experiment.sentences)
+
+
+def test_the_sentence_its_tokens_and_its_object_belong_together(env: gym.Env) -> None:
+    for index, instruction in enumerate(env.unwrapped.experiment.instructions):
+        obs, _ = env.reset(options={"instruction": index})
+        assert env.unwrapped.get_language_instruction() == [instruction.text]
+        chosen = obs["extra"]["target_object"][0].argmax().item()
+        assert env.unwrapped.experiment.objects[chosen].name == instruction.target
+        words = [catalog.VOCABULARY[token] for token in obs["extra"]["instruction"][0]]
+        assert words == instruction.text.lower().replace(".", " .").split()
+    with pytest.raises(ValueError, match="'instruction': got 3, expected indices 0 to"):
+        env.reset(options={"instruction": 3})
+
+
+def test_an_episode_is_finite_and_ends_by_time_alone(env: gym.Env) -> None:
+    env.reset(seed=2)
+    for step, action in enumerate(actions(32)):
+        obs, reward, terminated, truncated, info = env.step(action)
+        assert all(leaf.isfinite().all() for leaf in leaves(obs).values())
+        assert reward.isfinite().all()
+        assert not terminated.any()
+        assert truncated.item() == (step == 31)
+        right, wrong = info["right_fingers"], info["wrong_fingers"]
+        assert info["success"].item() == (right > 0).item()
+        assert 0 <= right <= 6
+        assert 0 <= wrong <= 6
+        assert info["exclusive_success"].item() == (
+            info["success_once"] & ~info["wrong_once"]
+        )
+
+
+def test_state_survives_the_round_trip(env: gym.Env) -> None:
+    base = env.unwrapped
+    for get, put in (
+        (base.get_state, base.set_state),
+        (base.get_state_dict, base.set_state_dict),
+    ):
+        env.reset(seed=4)
+        for action in actions(5):
+            env.step(action)
+        saved, flat = get(), base.get_state().clone()
+        sentence = base.get_language_instruction()
+        env.reset(seed=5)
+        put(saved)
+        assert base.get_language_instruction() == sentence
+        torch.testing.assert_close(base.get_state(), flat)
+
+
+# -- Modes ----------------------------------------------------------------------------
+
+
+def test_the_defaults_are_the_papers() -> None:
+    env = gym.make("ir_maniskill:NaoTouchCubeSingle-v1", obs_mode="rgb")
+    obs, _ = env.reset(seed=0)
+    for camera in ("top_camera", "front_camera"):
+        picture = obs["sensor_data"][camera]["rgb"]
+        assert (tuple(picture.shape), picture.dtype) == ((1, 512, 256, 3), torch.uint8)
+        assert picture.float().std() > 10  # there is something to see
+    assert env.unwrapped.control_mode == "pd_joint_pos"
+    assert env.unwrapped.reward_mode == "sparse"
+    env.close()
+
+
+@pytest.mark.parametrize("mode", ["state", "state_dict", "rgb", "rgbd"])
+def test_observation_modes(mode: str) -> None:
+    cameras = {"width": 16, "height": 32}
+    env = gym.make("NaoTouchButtonMulti-v1", obs_mode=mode, sensor_configs=cameras)
+    obs, _ = env.reset(seed=0)
+    if mode == "state":
+        assert obs.shape == (1, 26 * 3 + 6 + 5 + 9 + 18 + 3)
+    else:
+        data = obs.get("sensor_data", {}).get("top_camera", {})
+        assert set(data) == {"rgb": {"rgb"}, "rgbd": {"rgb", "depth"}}.get(mode, set())
+        assert ("object_position" in obs["extra"]) == (mode == "state_dict")
+    env.close()
+
+
+def test_unknown_ids_and_modes_are_refused() -> None:
+    with pytest.raises(gym.error.NameNotFound):
+        gym.make("NaoTouchCubeSolo-v1")
+    with pytest.raises(catalog.UnknownExperimentError, match="available: NaoTouch"):
+        TouchEnv(experiment="NaoTouchCubeSolo-v1")
+    with pytest.raises(NotImplementedError, match="smell"):
+        gym.make("NaoTouchCubeSingle-v1", reward_mode="smell", render_backend="none")
+
+
+# -- Touch ----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def fixed() -> Iterator[gym.Env]:
+    """The triangle without any jitter, driven by absolute targets."""
+    still = dataclasses.replace(
+        catalog.get("NaoTouchCubeTriangle-v1"),
+        id="FixedTriangle-v1",
+        jitter=Jitter(0, 0, 0),
+    )
+    ir_maniskill.register(still)
+    env = gym.make(
+        "FixedTriangle-v1",
+        obs_mode="state_dict",
+        render_backend="none",
+        max_episode_steps=1000,
+    )
+    yield env
+    env.close()
+
+
+def hold(env: gym.Env, steps: int = 12, **joints: float) -> tuple[dict, float, dict]:
+    """Hold joints at a target, all others at the start; return the last step."""
+    target = np.zeros(26, np.float32)
+    joints = {"LShoulderPitch": -0.1, "RShoulderPitch": -0.1} | joints
+    for name, value in joints.items():
+        target[JOINTS.index(name)] = value
+    for _ in range(steps):
+        obs, reward, _, _, info = env.step(target)
+    return obs, reward.item(), info
+
+
+RED, GREEN = 1, 2
+PRESS = {"LShoulderPitch": 0.10, "LShoulderRoll": -0.1}
+
+
+def test_without_jitter_the_scene_is_the_papers_fixed_one(fixed: gym.Env) -> None:
+    a, b = (fixed.reset(seed=seed, options={"instruction": 0})[0] for seed in (1, 2))
+    assert all(torch.equal(x, leaves(b)[path]) for path, x in leaves(a).items())
+    expected = [[0.19, 0.0, 0.05], [0.23, 0.08, 0.05], [0.23, -0.08, 0.05]]
+    torch.testing.assert_close(a["extra"]["object_position"][0], torch.tensor(expected))
+
+
+def test_pressing_a_finger_on_the_named_cube_is_felt_and_rewarded(
+    fixed: gym.Env,
+) -> None:
+    fixed.reset(seed=0, options={"instruction": RED})
+    obs, reward, info = hold(fixed)
+    assert not obs["extra"]["touch"].any()
+    assert reward == 0
+    obs, reward, info = hold(fixed, **PRESS)
+    touching = obs["extra"]["touch"][0]
+    assert touching[:3].any()  # left fingers
+    assert not touching[3:].any()
+    assert info["success"].item()
+    assert reward == pytest.approx(touching.sum().item())
+    obs, reward, info = hold(fixed, LShoulderPitch=-0.3)  # lift the hand
+    assert not obs["extra"]["touch"].any()
+    assert reward == 0
+    assert not info["success"].item()
+    assert info["success_once"].item()
+    assert info["exclusive_success"].item()
+
+
+def test_touching_a_wrong_cube_is_penalized(fixed: gym.Env) -> None:
+    fixed.reset(seed=0, options={"instruction": GREEN})
+    obs, reward, info = hold(fixed, **PRESS)
+    fingers = obs["extra"]["touch"].sum().item()
+    assert fingers >= 1
+    assert reward == pytest.approx(-0.1 * fingers)
+    assert info["wrong_once"].item()
+    assert not info["success_once"].item()
+
+
+def test_touching_the_table_is_nothing(fixed: gym.Env) -> None:
+    fixed.reset(seed=0, options={"instruction": RED})
+    obs, reward, info = hold(fixed, 20, LShoulderPitch=0.30, LShoulderRoll=0.75)
+    heights = obs["extra"]["finger_position"][0, :3, 2]
+    assert heights.min() < 0.03 + 0.02  # a fingertip is down on the table
+    contacts = fixed.unwrapped.scene.get_contacts()
+    names = {body.entity.name for c in contacts for body in c.bodies}
+    assert any(name.startswith(("LFinger", "LThumb")) for name in names)
+    assert not obs["extra"]["touch"].any()
+    assert reward == 0
+    assert not info["wrong_once"].item()
+
+
+def test_a_reset_forgets_the_touches_of_the_last_episode(fixed: gym.Env) -> None:
+    fixed.reset(seed=0, options={"instruction": RED})
+    hold(fixed, **PRESS)
+    obs, info = fixed.reset()
+    assert not obs["extra"]["touch"].any()
+    assert not info["success_once"].any()
+
+
+def test_dense_reward_grows_as_the_hand_comes_near() -> None:
+    env = gym.make(
+        "NaoTouchCubeTriangle-v1",
+        obs_mode="none",
+        reward_mode="normalized_dense",
+        render_backend="none",
+    )
+    env.reset(seed=0, options={"instruction": RED})
+    far = hold(env, LShoulderPitch=-0.5, RShoulderPitch=-0.5)[1]
+    near = hold(env)[1]
+    on_it = hold(env, **PRESS)[1]
+    assert 0 <= far < near < on_it <= 1
+    env.close()
+
+
+# -- At home in its ecosystem ---------------------------------------------------------
+
+
+def test_record_episode_writes_a_playable_video(tmp_path: Path) -> None:
+    env = gym.make(
+        "NaoTouchCubeMulti-v1",
+        obs_mode="state_dict",
+        render_mode="rgb_array",
+        human_render_camera_configs={"width": 128, "height": 96},
+    )
+    env = RecordEpisode(env, str(tmp_path), video_fps=20, save_trajectory=True)
+    env.reset(seed=0)
+    for action in actions(32):
+        env.step(action)
+    env.close()
+    (video,) = tmp_path.glob("*.mp4")
+    frames = iio.imread(video)
+    assert frames.shape[0] >= 32
+    assert frames.astype(float).std() > 10
+    assert list(tmp_path.glob("*.h5"))
+
+
+def test_gymnasiums_checker_accepts_the_cpu_wrapper() -> None:
+    env = gym.make("NaoTouchButtonSingle-v1", obs_mode="state", render_backend="none")
+    # Left out: what makes the env anew from its spec, since ManiSkill's time limit
+    # wrapper does not record its arguments.
+    check_env(CPUGymWrapper(env), skip_render_check=True, skip_close_check=True)
+    env.close()
