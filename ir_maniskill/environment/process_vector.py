@@ -311,7 +311,7 @@ class ProcessVectorEnv(VectorEnv):
             if not ready:
                 names = ", ".join(self._describe(index) for index in sorted(pending))
                 raise WorkerError(
-                    f"no answer within {self._timeout:.0f} s from {names}"
+                    f"no answer within {self._timeout:g} s from {names}"
                 )
             for index in [i for i in pending if self._pipes[i] in ready]:
                 pending.remove(index)

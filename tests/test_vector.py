@@ -1,0 +1,198 @@
+"""Vector envs: same numbers as single envs, ends of episodes, failures, leftovers."""
+
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Iterator
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import ir_maniskill
+from ir_maniskill import experiment as catalog
+from ir_maniskill.environment.process_vector import ProcessVectorEnv, WorkerError
+from ir_maniskill.environment.vector import make_vec
+
+TASK = "NaoTouchCubeTriangle-v1"
+KWARGS = {"obs_mode": "state_dict", "render_backend": "none"}
+
+
+@pytest.fixture(scope="module")
+def envs() -> Iterator[ProcessVectorEnv]:
+    """Three envs in two processes, without pictures."""
+    envs = make_vec(TASK, 3, num_workers=2, sim_backend="physx_cpu", **KWARGS)
+    yield envs
+    envs.close()
+
+
+def actions(steps: int, num_envs: int) -> torch.Tensor:
+    """Return fixed random actions [T, N, 26]."""
+    generator = torch.Generator().manual_seed(0)
+    return 2 * torch.rand(steps, num_envs, 26, generator=generator) - 1
+
+
+def test_env_i_is_a_single_env_seeded_with_seed_plus_i(envs: ProcessVectorEnv) -> None:
+    many, _ = envs.reset(seed=11)
+    single = gym.make(TASK, num_envs=1, **KWARGS)
+    one, _ = single.reset(seed=12)
+    for action in actions(6, 3):
+        for part in ("agent", "extra"):
+            for name, value in one[part].items():
+                assert torch.equal(many[part][name][1], value[0])
+                assert many[part][name].dtype == value.dtype
+        many, rewards, *_, infos = envs.step(action)
+        one, reward, *_, info = single.step(action[1])
+        assert rewards[1] == reward[0]
+        assert torch.equal(infos["contact"][1], info["contact"][0])
+    single.close()
+
+
+def test_observations_are_in_the_declared_space(envs: ProcessVectorEnv) -> None:
+    obs, _ = envs.reset(seed=0)
+    assert obs["extra"]["object_position"].shape == (3, 3, 3)
+    arrays = {p: {k: v.numpy() for k, v in obs[p].items()} for p in obs}
+    assert envs.observation_space.contains(arrays)
+
+
+def test_an_episode_ends_in_the_same_step_it_is_reset(envs: ProcessVectorEnv) -> None:
+    first, _ = envs.reset(seed=5)
+    for step, action in enumerate(actions(32, 3)):
+        obs, _, terminated, truncated, info = envs.step(action)
+        assert not terminated.any()
+        assert truncated.all() == (step == 31)
+        assert ("final_observation" in info) == (step == 31)
+    assert info["_final_info"].all()
+    assert info["_final_observation"].all()
+    assert info["final_info"]["elapsed_steps"].tolist() == [32, 32, 32]
+    assert info["elapsed_steps"].tolist() == [0, 0, 0]
+    start = first["extra"]["object_position"]
+    assert not torch.equal(obs["extra"]["object_position"], start)
+    final = info["final_observation"]["agent"]["proprioception"]
+    assert not torch.equal(final, obs["agent"]["proprioception"])
+
+
+def test_returned_tensors_are_not_overwritten_later(envs: ProcessVectorEnv) -> None:
+    obs, _ = envs.reset(seed=1)
+    before = obs["agent"]["proprioception"].clone()
+    envs.step(actions(1, 3)[0])
+    assert torch.equal(obs["agent"]["proprioception"], before)
+
+
+def test_options_are_dealt_out_one_each(envs: ProcessVectorEnv) -> None:
+    wanted = torch.tensor([2, 0, 1])
+    obs, _ = envs.reset(seed=0, options={"instruction": wanted})
+    assert obs["extra"]["target_object"].argmax(1).tolist() == wanted.tolist()
+
+
+def test_random_streams_can_be_restored(envs: ProcessVectorEnv) -> None:
+    envs.reset(seed=3)
+    drawn, _ = envs.reset()
+    streams = envs.get_rng_state()
+    envs.reset()
+    envs.set_rng_state(streams)
+    again, _ = envs.reset()
+    key = "object_position"
+    assert torch.equal(drawn["extra"][key], again["extra"][key])
+
+
+def test_wrong_shapes_are_refused(envs: ProcessVectorEnv) -> None:
+    with pytest.raises(ValueError, match=r"got shape \(2, 26\), expected \(3, 26\)"):
+        envs.step(torch.zeros(2, 26))
+    with pytest.raises(ValueError, match="seeds: got 2, expected 3"):
+        envs.reset(seed=[1, 2])
+    with pytest.raises(ValueError, match="num_envs: got 0"):
+        make_vec(TASK, 0)
+    with pytest.raises(catalog.UnknownExperimentError, match="available"):
+        make_vec("NoSuchTask-v1", 1)
+
+
+def test_users_own_experiments_reach_the_workers() -> None:
+    triangle = catalog.get(TASK)
+    mine = dataclasses.replace(triangle, id="Mine-v1", episode_steps=4)
+    ir_maniskill.register(mine)
+    envs = make_vec("Mine-v1", 1, sim_backend="physx_cpu", **KWARGS)
+    envs.reset(seed=0)
+    ends = [envs.step(action)[3].item() for action in actions(4, 1)]
+    assert ends == [False, False, False, True]
+    envs.close()
+
+
+def test_a_failing_worker_says_why() -> None:
+    with pytest.raises(WorkerError, match=r"worker-0 \(envs 0 to 0\)(.|\n)*smell"):
+        make_vec(TASK, 1, sim_backend="physx_cpu", reward_mode="smell", **KWARGS)
+
+
+def test_a_dead_worker_is_named_and_close_leaves_nothing() -> None:
+    envs = make_vec(TASK, 2, num_workers=2, sim_backend="physx_cpu", **KWARGS)
+    envs.reset(seed=0)
+    victims = [process.pid for process in envs._processes]
+    os.kill(victims[1], signal.SIGKILL)
+    with pytest.raises(WorkerError, match=r"worker-1 \(envs 1 to 1\) died.*code -9"):
+        envs.step(torch.zeros(2, 26))
+    envs.close()
+    assert not any(alive(pid) for pid in victims)
+
+
+def test_a_hanging_worker_is_named_instead_of_waited_for() -> None:
+    envs = ProcessVectorEnv(catalog.get(TASK), 1, env_kwargs=KWARGS)
+    envs.reset(seed=0)
+    envs._timeout = 0.5
+    os.kill(envs._processes[0].pid, signal.SIGSTOP)
+    with pytest.raises(WorkerError, match="no answer within 0.5 s from .*worker-0"):
+        envs.step(torch.zeros(1, 26))
+    pid = envs._processes[0].pid
+    envs.close()
+    assert not alive(pid)
+
+
+def alive(pid: int) -> bool:
+    """Return whether a process of that id runs (a zombie does not)."""
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().split(") ")[1][0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.slow
+def test_workers_end_when_the_parent_is_killed() -> None:
+    script = """
+        import time
+        from ir_maniskill import make_vec
+        if __name__ == "__main__":
+            envs = make_vec("NaoTouchCubeSingle-v1", 2, num_workers=2,
+                            sim_backend="physx_cpu", obs_mode="state_dict",
+                            render_backend="none")
+            print(*(p.pid for p in envs._processes), flush=True)
+            time.sleep(60)
+    """
+    parent = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(script)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    workers = [int(pid) for pid in parent.stdout.readline().split()]
+    assert len(workers) == 2
+    parent.kill()
+    parent.wait()
+    deadline = time.monotonic() + 20
+    while any(map(alive, workers)) and time.monotonic() < deadline:
+        time.sleep(0.2)
+    assert not any(map(alive, workers))
+
+
+def test_pictures_cross_the_process_border(multi_vec: ProcessVectorEnv) -> None:
+    obs, _ = multi_vec.reset(seed=0)
+    obs = multi_vec.step(np.zeros((2, 26), np.float32))[0]
+    for camera in ("top_camera", "front_camera"):
+        picture = obs["sensor_data"][camera]["rgb"]
+        assert picture.shape == (2, 64, 32, 3)
+        assert picture.dtype == torch.uint8
+        assert picture.float().std() > 10
