@@ -309,7 +309,7 @@ def _play(
         range(0, episodes, n), "evaluate", disable=not progress, leave=False
     ):
         episode = torch.arange(first, first + n)  # [N]
-        options = pinned(told[episode % episodes].to(envs.device))
+        options = {"instruction": told[episode % episodes].to(envs.device)}
         obs, _ = envs.reset(seed=seed + first, options=options)
         state = stack.reset(obs)
         playing = episode < episodes  # the last round may have envs to spare
@@ -333,15 +333,6 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-def pinned(instruction: Tensor | int) -> dict[str, Any]:
-    """Returns reset options for an episode that only its seed and sentence decide.
-
-    PhysX carries contacts and the order of bodies over from one episode to the next,
-    which is enough to end elsewhere; a scene that is built anew remembers nothing.
-    """
-    return {"instruction": instruction, "reconfigure": True}
 
 
 def _act(policy: Policy, state: dict[str, Tensor], device: torch.device) -> Tensor:

@@ -21,7 +21,7 @@ from mani_skill.utils.sapien_utils import look_at
 from PIL import Image, ImageDraw, ImageFont
 
 from ir_maniskill.environment.state import StateStack
-from ir_maniskill.training.evaluate import Policy, one_thread, pinned
+from ir_maniskill.training.evaluate import Policy, one_thread
 
 Box = tuple[int, int, int, int]
 """Left, top, width and height [pixel]."""
@@ -112,7 +112,7 @@ def record(
         base: Any = env.unwrapped
         told = tuple(instructions or range(len(base.experiment.sentences)))
         for episode in range(episodes):
-            options = pinned(told[episode % len(told)])
+            options = {"instruction": told[episode % len(told)]}
             obs, _ = env.reset(seed=seed + episode, options=options)
             yield from _play(policy, env, obs, StateStack(frames), stage)
     finally:
