@@ -173,8 +173,9 @@ class TrainConfig:
     "pd_joint_pos" sets them (the paper's)."""
     reward_mode: str = "sparse"
     """Reward of the task: "sparse" is the paper's."""
-    shader_pack: str | None = None
-    """Shader pack of the cameras; None: the task's own."""
+    shader_pack: str | None = "trivial"
+    """Shader pack of the cameras: "trivial" is unlit and by far the cheapest, "minimal"
+    and "default" are lit; None: the task's own."""
     camera_height: int = 64
     """Height of each image [pixel]."""
     camera_width: int = 32
