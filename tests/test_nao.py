@@ -95,7 +95,7 @@ def test_delta_targets_do_not_wind_up() -> None:
             env.step(up)
         obs = env.step(-up)[0]
         target = obs["agent"]["target"][0, JOINTS.index("LWristYaw")]
-        assert target.item() == pytest.approx(1 - 0.15, abs=1e-5)
+        assert target.item() == pytest.approx(1 - 0.2, abs=1e-5)
 
 
 def test_drives_have_the_real_motors_limits(env: TouchEnv) -> None:

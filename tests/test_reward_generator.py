@@ -70,19 +70,26 @@ def test_counts_are_within_bounds(n: int, f: int, c: int, seed: int) -> None:
 
 
 def test_dense_reward_adds_reaching_and_takes_wrong_touches() -> None:
-    weights = DenseWeights(reach=0.5, reach_scale=0.1, wrong=0.3)
-    count = FingerCount(torch.tensor([0, 0, 1]), torch.tensor([0, 2, 0]))
-    distance = torch.tensor([[0.1, 0.3], [0.3, 0.0], [0.0, 0.0]])
-    reward = dense_reward(LINE, count, distance, weights)
+    weights = DenseWeights(reach=0.5, reach_scale=0.1, wrong=0.3, spoiled=0.2)
+    count = FingerCount(torch.tensor([0, 0, 1, 1]), torch.tensor([0, 2, 0, 0]))
+    distance = torch.tensor([[0.1, 0.3], [0.3, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    wrong_once = torch.tensor([False, True, False, True])
+    reward = dense_reward(LINE, count, distance, wrong_once, weights)
     at_scale = 0.5 * (1 - 0.7615942)
-    assert reward.tolist() == pytest.approx([at_scale, 0.5 - 0.3, 1.5])
+    assert reward.tolist() == pytest.approx([at_scale, 0.5 - 0.3, 1.5, 0.5 + 0.2])
 
 
 def test_highest_reward_bounds_the_dense_one() -> None:
     weights = DenseWeights()
     all_fingers = FingerCount(torch.tensor([6]), torch.tensor([0]))
     for experiment in (LINE, TRIANGLE):
-        best = dense_reward(experiment, all_fingers, torch.zeros(1, 6), weights)
+        best = dense_reward(
+            experiment,
+            all_fingers,
+            torch.zeros(1, 6),
+            torch.zeros(1, dtype=torch.bool),
+            weights,
+        )
         assert best.item() == pytest.approx(highest_reward(experiment, 6, weights))
 
 

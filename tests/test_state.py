@@ -30,6 +30,7 @@ def observation(*values: float, privileged: bool = False) -> dict:
             torch.arange(9.0).view(1, 3, 3).repeat(batch, 1, 1)
         )
         obs["extra"]["finger_position"] = torch.zeros(batch, 6, 3)
+        obs["extra"]["wrong_once"] = torch.zeros(batch, 1)
         obs["extra"]["target_object"] = torch.tensor([[0.0, 1.0, 0.0]] * batch)
     return obs
 
@@ -79,5 +80,5 @@ def test_peeking_changes_nothing() -> None:
 def test_the_simulators_state_is_there_only_when_asked_for() -> None:
     assert "privileged" not in flatten(observation(1))
     state = flatten(observation(1, 2, privileged=True))
-    assert state["privileged"].shape == (2, 26 + 9 + 18 + 3)
+    assert state["privileged"].shape == (2, 26 + 9 + 18 + 3 + 1)
     assert state["target_position"].tolist() == [[3.0, 4.0, 5.0]] * 2

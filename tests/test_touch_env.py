@@ -178,7 +178,7 @@ def test_observation_modes(mode: str) -> None:
     env = gym.make("NaoTouchButtonMulti-v1", obs_mode=mode, sensor_configs=cameras)
     obs, _ = env.reset(seed=0)
     if mode == "state":
-        assert obs.shape == (1, 26 * 3 + 6 + 5 + 9 + 18 + 3)
+        assert obs.shape == (1, 26 * 3 + 6 + 5 + 9 + 18 + 3 + 1)
     else:
         data = obs.get("sensor_data", {}).get("top_camera", {})
         assert set(data) == {"rgb": {"rgb"}, "rgbd": {"rgb", "depth"}}.get(mode, set())

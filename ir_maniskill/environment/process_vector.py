@@ -310,9 +310,7 @@ class ProcessVectorEnv(VectorEnv):
             ready = wait([self._pipes[index] for index in pending], left)
             if not ready:
                 names = ", ".join(self._describe(index) for index in sorted(pending))
-                raise WorkerError(
-                    f"no answer within {self._timeout:g} s from {names}"
-                )
+                raise WorkerError(f"no answer within {self._timeout:g} s from {names}")
             for index in [i for i in pending if self._pipes[i] in ready]:
                 pending.remove(index)
                 try:

@@ -61,26 +61,33 @@ class DenseWeights:
     """Distance at which `reach` has fallen to a quarter, about [m]."""
     wrong: float = 0.5
     """Taken while another object is touched by any finger."""
+    spoiled: float = 0.25
+    """Share of the touch reward that is left once another object has been touched in
+    the episode: what makes touching only the named object worth learning."""
 
 
 def dense_reward(
     experiment: Experiment,
     count: FingerCount,
     distance: Tensor,
+    wrong_once: Tensor,
     weights: DenseWeights,
 ) -> Tensor:
-    """Return the sparse reward plus shaping toward the named object [N] float32.
+    """Return the sparse reward shaped toward touching the named object alone [N].
 
     Args:
         experiment: Whose reward to shape.
         count: Fingers on the named and on other objects.
         distance: From each finger to the named object's center [N, F] [m].
+        wrong_once: Whether another object has been touched so far [N] bool.
         weights: How much each term counts.
     """
     nearest = distance.min(dim=1).values  # [N]
     reach = weights.reach * (1 - torch.tanh(nearest / weights.reach_scale))
     wrong = weights.wrong * count.wrong.clamp(max=1)
-    return sparse_reward(experiment, count) + reach - wrong
+    kept = torch.where(wrong_once, weights.spoiled, 1.0)  # [N]
+    touch = sparse_reward(experiment, count)
+    return torch.where(touch > 0, kept * touch, touch) + reach - wrong
 
 
 def highest_reward(

@@ -40,7 +40,10 @@ def flatten(obs: dict) -> State:
         state["images"] = torch.stack(pictures, dim=1)
     if "object_position" in extra:
         positions, chosen = extra["object_position"], extra["target_object"]
-        parts = (agent["velocity"], positions, extra["finger_position"], chosen)
+        parts = [agent["velocity"], positions]
+        parts += [
+            extra[key] for key in ("finger_position", "target_object", "wrong_once")
+        ]
         state["privileged"] = torch.cat([part.flatten(1) for part in parts], dim=1)
         state["target_position"] = (positions * chosen[..., None]).sum(dim=1)
     return state

@@ -275,6 +275,7 @@ class TouchEnv(BaseEnv):
             obs["object_position"] = self._object_position()  # [N, C, 3]
             obs["finger_position"] = self.agent.finger_position()  # [N, F, 3]
             obs["target_object"] = one_hot.float()  # [N, C]
+            obs["wrong_once"] = info["wrong_once"].float()[:, None]  # [N, 1]
         return obs
 
     def _flatten_raw_obs(self, obs: Any) -> Any:
@@ -309,7 +310,11 @@ class TouchEnv(BaseEnv):
         goal = self._object_position()[rows, self.target_index]  # [N, 3]
         distance = (self.agent.finger_position() - goal[:, None]).norm(dim=-1)
         return reward_generator.dense_reward(
-            self.experiment, _count(info), distance, self.dense_weights
+            self.experiment,
+            _count(info),
+            distance,
+            info["wrong_once"],
+            self.dense_weights,
         )
 
     def compute_normalized_dense_reward(

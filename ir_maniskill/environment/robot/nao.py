@@ -61,8 +61,8 @@ class JointGroup:
     """Largest change of the target in one step [half the joint's range]."""
 
 
-ARM = JointGroup(stiffness=20.0, damping=2.0, armature=1e-2, delta=0.15)
-HAND = JointGroup(stiffness=2.0, damping=0.1, armature=1e-3, delta=0.15)
+ARM = JointGroup(stiffness=20.0, damping=2.0, armature=1e-2, delta=0.2)
+HAND = JointGroup(stiffness=2.0, damping=0.1, armature=1e-3, delta=0.2)
 
 # -- Collision -----------------------------------------------------------------------
 
@@ -239,7 +239,7 @@ class Nao(BaseAgent):
         return ((position - self._middle) / self._half_range).clamp(-1, 1)
 
 
-HANDS_OVER_TABLE = {"LShoulderPitch": -0.2, "RShoulderPitch": -0.2}
+HANDS_OVER_TABLE = {"LShoulderPitch": -0.13, "RShoulderPitch": -0.13}
 """Hands hovering over the objects; joints not named are at the middle [rad]."""
 
 REST = {
