@@ -1,6 +1,10 @@
 """What every task must do, and what a touch is."""
 
 import dataclasses
+import os
+import subprocess
+import sys
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -334,3 +338,27 @@ def test_gymnasiums_checker_accepts_the_cpu_wrapper() -> None:
     # wrapper does not record its arguments.
     check_env(CPUGymWrapper(env), skip_render_check=True, skip_close_check=True)
     env.close()
+
+
+def test_without_vulkan_there_is_one_clear_error_and_state_modes_work() -> None:
+    script = """
+        import gymnasium as gym, ir_maniskill
+        task = "NaoTouchButtonSingle-v1"
+        env = gym.make(task, obs_mode="state", render_backend="none")
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+        try:
+            gym.make(task, obs_mode="rgb")
+        except RuntimeError as error:
+            print(error)
+    """
+    nowhere = {"VK_DRIVER_FILES": "/nowhere", "VK_ICD_FILENAMES": "/nowhere"}
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)],
+        env=os.environ | nowhere,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "expected a Vulkan device" in done.stdout
+    assert "What to do:" in done.stdout

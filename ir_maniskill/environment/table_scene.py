@@ -74,21 +74,25 @@ def build_room(scene: ManiSkillScene) -> Actor:
 def build_object(scene: ManiSkillScene, thing: TouchObject) -> Actor:
     """Build one object: a free cube, or a button that stays where it is put."""
     builder = scene.create_actor_builder()
-    material = sapien.render.RenderMaterial(
-        base_color=[*COLORS[thing.color], 1.0], roughness=0.45, specular=0.4
-    )
     height = OBJECT_HEIGHT[thing.shape]
     builder.initial_pose = sapien.Pose([*thing.position, TABLE_TOP + height / 2])
     if thing.shape == "cube":
         half = [OBJECT_SIZE / 2] * 3
         builder.add_box_collision(half_size=half, density=CUBE_MASS / OBJECT_SIZE**3)
-        builder.add_box_visual(half_size=half, material=material)
+        if scene.can_render():
+            builder.add_box_visual(half_size=half, material=_material(thing))
         return builder.build(name=thing.name)
     upright = sapien.Pose(q=[math.sqrt(0.5), 0, -math.sqrt(0.5), 0])
     builder.add_cylinder_collision(upright, OBJECT_SIZE / 2, height / 2)
-    mesh = files("ir_maniskill.assets") / "scene" / "button.glb"
-    builder.add_visual_from_file(str(mesh), material=material)
+    if scene.can_render():
+        mesh = files("ir_maniskill.assets") / "scene" / "button.glb"
+        builder.add_visual_from_file(str(mesh), material=_material(thing))
     return builder.build_kinematic(name=thing.name)
+
+
+def _material(thing: TouchObject) -> sapien.render.RenderMaterial:
+    color = [*COLORS[thing.color], 1.0]
+    return sapien.render.RenderMaterial(base_color=color, roughness=0.45, specular=0.4)
 
 
 def add_lights(scene: ManiSkillScene, shadow: bool) -> None:

@@ -19,6 +19,7 @@ from mani_skill.utils.structs.types import SceneConfig, SimConfig
 from torch import Tensor
 
 from ir_maniskill import experiment as catalog
+from ir_maniskill.doctor import require_vulkan
 from ir_maniskill.environment import reward_generator, table_scene
 from ir_maniskill.environment.contacts import contact_query
 from ir_maniskill.environment.instructional_set import InstructionalSet
@@ -76,6 +77,7 @@ class TouchEnv(BaseEnv):
 
         Raises:
             UnknownExperimentError: There is no experiment of that id.
+            RuntimeError: No Vulkan device can render here; says what to install.
         """
         if isinstance(experiment, str):
             experiment = catalog.get(experiment)
@@ -83,6 +85,8 @@ class TouchEnv(BaseEnv):
         self.dense_weights = replace(DenseWeights(), **(dense_weights or {}))
         if render_backend == "auto":
             render_backend = "gpu" if torch.cuda.is_available() else "cpu"
+        if render_backend not in ("none", None):
+            require_vulkan()
         super().__init__(
             *args, robot_uids=robot_uids, render_backend=render_backend, **kwargs
         )
