@@ -247,7 +247,7 @@ class TrainConfig:
         return {
             "obs_mode": modes.get((sees, state), "state_dict"),
             "control_mode": self.control_mode,
-            "reward_mode": self.reward_mode,
+            "reward_mode": self.reward_mode if training else "sparse",
             "sensor_configs": cameras,
         }
 
