@@ -1,0 +1,60 @@
+"""Evaluate a policy over seeded episodes, and film it.
+
+    python examples/evaluate_and_record.py --checkpoint runs/single/best.safetensors
+    python examples/evaluate_and_record.py --task NaoTouchCubeTriangle-v1
+
+Without a checkpoint the policy is one that acts at random: the figure to beat. Any
+function from the state s_t to actions in [-1, 1] can stand in its place.
+"""
+
+from pathlib import Path
+
+import torch
+import tyro
+from torch import Tensor
+
+from ir_maniskill.training.checkpoint import load_policy
+from ir_maniskill.training.config import CONFIGS
+from ir_maniskill.training.evaluate import evaluate_policy, write_report
+from ir_maniskill.training.video import record, write_video
+
+
+def random_policy(state: dict[str, Tensor]) -> Tensor:
+    """Returns random actions [N, 26]."""
+    return 2 * torch.rand(len(state["instruction"]), 26) - 1
+
+
+def main(
+    checkpoint: Path | None = None,
+    task: str = "NaoTouchCubeSingle-v1",
+    episodes: int = 30,
+    films: int = 1,
+    out: Path = Path("runs/evaluation"),
+) -> None:
+    """Evaluates, prints the figures, and writes report.json and video.mp4."""
+    policy, config = random_policy, CONFIGS["default"]
+    if checkpoint is not None:
+        agent, config, _ = load_policy(checkpoint)
+        policy, task = agent.policy, config.env_id
+    env_kwargs = config.env_kwargs(training=False)
+    seed, frames = 2_000_000, config.frames
+    report = evaluate_policy(
+        policy,
+        task,
+        episodes=episodes,
+        seed=seed,
+        frames=frames,
+        env_kwargs=env_kwargs,
+        progress=True,
+    )
+    print(report)
+    write_report(out / "report.json", report, checkpoint=str(checkpoint))
+    steps = record(
+        policy, task, episodes=films, seed=seed, frames=frames, env_kwargs=env_kwargs
+    )
+    write_video(out / "video.mp4", steps)
+    print(f"report.json and video.mp4 are in {out}.")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

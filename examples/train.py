@@ -1,0 +1,56 @@
+"""Train an agent on an experiment of the paper: single, multi or triangle.
+
+    python examples/train.py single
+    python examples/train.py triangle --preset paper --steps 1000000
+    python examples/train.py multi --resume
+
+Learns from the two cameras and the sentence. Ctrl-C keeps a checkpoint, from which
+--resume goes on. `ir-maniskill train ID` does the same with every number as an option.
+"""
+
+import logging
+from dataclasses import replace
+from typing import Annotated, Literal
+
+import tyro
+
+from ir_maniskill.training.config import CONFIGS, TrainConfig
+from ir_maniskill.training.train import train
+
+TASKS = {
+    "single": "NaoTouchCubeSingle-v1",  # experiment I: one sentence
+    "multi": "NaoTouchCubeMulti-v1",  # experiment II: three sentences
+    "triangle": "NaoTouchCubeTriangle-v1",  # experiment III: a reward per finger
+}
+STEPS = {"single": 60_000, "multi": 250_000, "triangle": 250_000}
+
+
+def configure(
+    experiment: str, preset: str, steps: int | None, out: str | None
+) -> TrainConfig:
+    """Returns the preset's configuration for an experiment."""
+    return replace(
+        CONFIGS[preset],
+        env_id=TASKS[experiment],
+        total_steps=steps or STEPS[experiment],
+        out=out or f"runs/{experiment}",
+    )
+
+
+def main(
+    experiment: Annotated[
+        Literal["single", "multi", "triangle"], tyro.conf.Positional
+    ] = "single",
+    preset: Literal["default", "paper"] = "default",
+    steps: int | None = None,
+    out: str | None = None,
+    resume: bool = False,
+) -> None:
+    """Trains, and says where the best policy is."""
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    best = train(configure(experiment, preset, steps, out), resume=resume)
+    print(f"The best policy is in {best}.")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
