@@ -86,6 +86,7 @@ class ToyVectorEnv:
                 "object_position": GOALS[None, :, None].repeat(self.num_envs, 1, 3),
                 "finger_position": goal[:, None].repeat(1, FINGERS, 3),
                 "target_object": one_hot,
+                "wrong_once": torch.zeros(self.num_envs, 1),
             },
         }
         if self.images:
@@ -99,7 +100,7 @@ class ToyVectorEnv:
 def toy_config(out, **changes):
     """Return a config with which the toy task is learned in seconds."""
     agent = AgentConfig(senses=("proprioception",), hidden=(32, 32), language_layers=1)
-    ppo = PPOConfig(rollouts=32, rollout_length=LENGTH, minibatch=64)
+    ppo = PPOConfig(rollouts=32, rollout_length=LENGTH, epochs=8, minibatch=64)
     values = {
         "env_id": "Toy-v1",
         "out": str(out),
