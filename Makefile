@@ -16,6 +16,8 @@ SOURCES     := ir_maniskill tasks assets tests examples scripts
 PYTEST      := $(BIN)/python -m pytest
 
 export TORCH_INDEX
+# Threads that wait for work must not take the cores from the simulator.
+export OMP_WAIT_POLICY ?= passive
 .DELETE_ON_ERROR:
 .PHONY: help setup demo test test-fast check format doctor wheel clean
 

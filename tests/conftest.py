@@ -10,8 +10,8 @@ import torch
 import ir_maniskill
 from ir_maniskill.environment.process_vector import ProcessVectorEnv
 
-SMALL = {"width": 32, "height": 64}
-"""Camera size of the tests [pixel]."""
+SMALL = {"width": 32, "height": 64, "shader_pack": "trivial"}
+"""Cameras of the tests: small, and with the shaders that compile fastest."""
 ENV_KWARGS = {
     "obs_mode": "rgb",
     "control_mode": "pd_joint_target_delta_pos",

@@ -37,7 +37,7 @@ def env(request: pytest.FixtureRequest, multi_env: gym.Env) -> Iterator[gym.Env]
         request.param,
         obs_mode="rgb+state_dict",
         control_mode=DELTA,
-        sensor_configs={"width": 32, "height": 64},
+        sensor_configs={"width": 32, "height": 64, "shader_pack": "trivial"},
     )
     yield env
     env.close()
@@ -178,7 +178,7 @@ def test_the_defaults_are_the_papers() -> None:
 
 @pytest.mark.parametrize("mode", ["state", "state_dict", "rgb", "rgbd"])
 def test_observation_modes(mode: str) -> None:
-    cameras = {"width": 16, "height": 32}
+    cameras = {"width": 16, "height": 32, "shader_pack": "trivial"}
     env = gym.make("NaoTouchButtonMulti-v1", obs_mode=mode, sensor_configs=cameras)
     obs, _ = env.reset(seed=0)
     if mode == "state":
