@@ -41,7 +41,7 @@ def _rgb(data: Tensor) -> dict[str, Tensor]:
     return {"rgb": (color * 255).byte() if color.is_floating_point() else color}
 
 
-UNLIT = ShaderConfig(
+TRIVIAL = ShaderConfig(
     shader_pack="trivial",
     texture_names={
         "Color": ["rgb"],
@@ -55,7 +55,15 @@ UNLIT = ShaderConfig(
     },
 )
 """SAPIEN's cheapest pack: base colors without lights. ManiSkill has no entry for it."""
-PREBUILT_SHADER_CONFIGS.setdefault("trivial", UNLIT)
+UNLIT = ShaderConfig(
+    shader_pack=str(files("ir_maniskill.assets") / "shaders" / "unlit"),
+    texture_names={"Color": ["rgb"]},
+    texture_transforms={"Color": _rgb},
+)
+"""Our own pack: the same colors as "trivial", pixel by pixel, at two thirds of its cost,
+since it writes nothing else. It has no depth and no segmentation."""
+PREBUILT_SHADER_CONFIGS.setdefault("trivial", TRIVIAL)
+PREBUILT_SHADER_CONFIGS.setdefault("unlit", UNLIT)
 
 
 def build_room(scene: ManiSkillScene) -> Actor:
