@@ -1,4 +1,4 @@
-"""Every example runs as a user would run it; training ones with tiny budgets."""
+"""Every example, and what the README shows, runs as a user would run it."""
 
 import os
 import re
@@ -10,6 +10,9 @@ from pathlib import Path
 import pytest
 
 from ir_maniskill import available
+from ir_maniskill.environment.robot.nao import ARM, HAND
+from ir_maniskill.experiment import get
+from ir_maniskill.training.config import CONFIGS
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 TINY = """
@@ -72,7 +75,7 @@ def test_train_knows_the_three_experiments_of_the_paper() -> None:
         for preset in ("default", "paper"):
             config = example["configure"](experiment, preset, None, None)
             assert experiment in config.env_id.lower()
-            assert config.total_steps == example["STEPS"][experiment]
+            assert config.total_steps == example["STEPS"][preset][experiment]
             assert config.out == f"runs/{experiment}"
 
 
@@ -108,3 +111,61 @@ def test_training_then_evaluating_its_policy(tmp_path: Path) -> None:
     assert re.search(r"Touch the blue cube\. +1 ", out)
     for name in ("report.json", "video.mp4"):
         assert (tmp_path / "runs" / "evaluation" / name).stat().st_size > 1000
+
+
+# -- The README ------------------------------------------------------------------------
+
+ROOT = EXAMPLES.parent
+README = (ROOT / "README.md").read_text()
+
+
+def row(start: str) -> list[str]:
+    """Returns the cells of the README's table row that begins so."""
+    (line,) = (s for s in README.splitlines() if s.startswith(f"| {start} |"))
+    return [cell.strip() for cell in line.strip("|").split("|")]
+
+
+def test_readme_lists_every_task_with_its_sentences() -> None:
+    listed = re.findall(r"^\| `(Nao\w+-v1)` \| [^|]+ \| (\d)", README, re.MULTILINE)
+    sentences = {name: str(len(get(name).sentences)) for name in available()}
+    assert dict(listed) == {k: v for k, v in sentences.items() if k.startswith("Nao")}
+
+
+def test_readme_tells_the_numbers_of_the_presets() -> None:
+    for column, preset in ((2, "paper"), (3, "default")):
+        config = CONFIGS[preset]
+        ppo, agent = config.ppo, config.agent
+        size = f"{config.camera_height} x {config.camera_width}"
+        expected = {
+            "action": f"`{config.control_mode}`",
+            "reward": f"`{config.reward_mode}`",
+            "image, high x wide": size,
+            "light": f"`{config.shader_pack}`",
+            "action noise": f"{agent.std}",
+            "roll-outs an update": f"{ppo.rollouts}",
+            "epochs": f"{ppo.epochs}",
+            "minibatch": f"{ppo.minibatch or 'all steps'}",
+            "advantage": f"λ = {ppo.gae_lambda:g}",
+            "discount γ": f"{ppo.gamma}",
+            "clip": f"{ppo.clip}",
+            "gradient norm": f"{ppo.max_grad_norm or 'any'}",
+            "steps": f"{config.total_steps // 1000} k",
+        }
+        for start, text in expected.items():
+            assert text in row(start)[column], start
+        assert float(row("learning rate")[column]) == ppo.learning_rate
+    assert f"at most {HAND.delta} of" in README and HAND.delta == ARM.delta
+
+
+def test_readme_links_lead_somewhere() -> None:
+    links = re.findall(r"\]\((?!http)([^)]+)\)", README.split("<!-- lead: a GIF")[0])
+    links += re.findall(r"\]\((?!http)([^)]+)\)", README.split("## Two commands")[1])
+    assert len(links) > 15
+    assert [link for link in links if not (ROOT / link).exists()] == []
+
+
+@pytest.mark.render
+@pytest.mark.slow
+def test_readme_quick_start_runs(tmp_path: Path) -> None:
+    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    assert re.search(r"^tensor\(\[(True|False)", run(tmp_path, "-c", code), re.M)
