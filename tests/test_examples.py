@@ -19,8 +19,9 @@ TINY = """
 import runpy, sys
 from dataclasses import replace
 import ir_maniskill.training.train as loop
+import ir_maniskill.training.video as video
 from ir_maniskill.training.config import CONFIGS, PPOConfig
-loop.FINAL_EPISODES = 1
+loop.FINAL_EPISODES, video.SHARPNESS = 1, 0.1
 small = dict(num_envs=2, num_workers=1, eval_episodes=1, ppo=PPOConfig(rollouts=2,
              epochs=1, minibatch=None), camera_height=32, camera_width=16)
 for name, config in CONFIGS.items():
@@ -28,7 +29,7 @@ for name, config in CONFIGS.items():
 sys.argv = sys.argv[1:]
 runpy.run_path(sys.argv[0], run_name="__main__")
 """
-"""Runs an example with its arguments, with presets that take seconds."""
+"""Runs an example with its arguments, with presets and films that take seconds."""
 
 
 def run(folder: Path, *command: str) -> str:
@@ -107,7 +108,7 @@ def test_training_then_evaluating_its_policy(tmp_path: Path) -> None:
     policy = tmp_path / "runs" / "single" / "best.safetensors"
     assert str(policy.relative_to(tmp_path)) in out and policy.is_file()
     arguments = ("--checkpoint", str(policy), "--episodes", "1")
-    out = run(tmp_path, script("evaluate_and_record.py"), *arguments)
+    out = run(tmp_path, "-c", TINY, script("evaluate_and_record.py"), *arguments)
     assert re.search(r"Touch the blue cube\. +1 ", out)
     for name in ("report.json", "video.mp4"):
         assert (tmp_path / "runs" / "evaluation" / name).stat().st_size > 1000
