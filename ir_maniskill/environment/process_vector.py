@@ -434,6 +434,9 @@ def _work(
     """Run a worker: answer commands until told to close or the parent is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     torch.set_num_threads(1)
+    # Mesa reads it when the first picture is asked for: workers keep all cores busy, so
+    # that drawing on further threads costs more than it gains.
+    os.environ.setdefault("LP_NUM_THREADS", "0")
     try:
         worker = _Worker(experiment, rows, env_kwargs)
         pipe.send((True, worker.describe()))

@@ -21,6 +21,7 @@ from torch import Tensor
 from ir_maniskill import experiment as catalog
 from ir_maniskill.doctor import require_vulkan
 from ir_maniskill.environment import reward_generator, table_scene
+from ir_maniskill.environment.bodies import positions
 from ir_maniskill.environment.contacts import contact_query
 from ir_maniskill.environment.instructional_set import InstructionalSet
 from ir_maniskill.environment.reward_generator import DenseWeights, FingerCount
@@ -290,7 +291,7 @@ class TouchEnv(BaseEnv):
         return super()._flatten_raw_obs(obs)
 
     def _object_position(self) -> Tensor:
-        return torch.stack([thing.pose.p for thing in self.objects], dim=1)
+        return positions(self.objects)
 
     def get_sensor_params(self) -> dict:
         """Return the cameras' matrices, computed once: no camera ever moves."""

@@ -23,6 +23,8 @@ from mani_skill.agents.registration import register_agent
 from mani_skill.utils.structs import Link
 from torch import Tensor
 
+from ir_maniskill.environment.bodies import positions
+
 # -- Joints: the action's order, all left then all right --------------------------
 
 ARM_JOINTS = ("ShoulderPitch", "ShoulderRoll", "ElbowYaw", "ElbowRoll", "WristYaw")
@@ -233,7 +235,7 @@ class Nao(BaseAgent):
 
     def finger_position(self) -> Tensor:
         """Return where the last link of each finger is [N, F, 3] [m]."""
-        return torch.stack([links[-1].pose.p for links in self.finger_links], dim=1)
+        return positions([links[-1] for links in self.finger_links])
 
     def _normalize(self, position: Tensor) -> Tensor:
         return ((position - self._middle) / self._half_range).clamp(-1, 1)
