@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box
 
+from ir_maniskill.experiment import VOCABULARY
 from ir_maniskill.training.config import AgentConfig, PPOConfig, TrainConfig
 
 LENGTH = 8  # steps of an episode
@@ -25,7 +26,9 @@ class ToyVectorEnv:
         self.device = torch.device("cpu")
         self.single_action_space = Box(-1, 1, (JOINTS,))
         senses = ("vision", "proprioception") if images else ("proprioception",)
-        self.experiment = SimpleNamespace(sentences=SENTENCES, senses=senses)
+        self.experiment = SimpleNamespace(
+            sentences=SENTENCES, senses=senses, vocabulary=VOCABULARY
+        )
         self.joints = torch.zeros(num_envs, JOINTS)
         self.told = torch.zeros(num_envs, dtype=torch.long)
         self.clock = torch.zeros(num_envs, dtype=torch.long)

@@ -60,7 +60,7 @@ UNLIT = ShaderConfig(
     texture_names={"Color": ["rgb"]},
     texture_transforms={"Color": _rgb},
 )
-"""Our own pack: the same colors as "trivial", pixel by pixel, at two thirds of its cost,
+"""Our own pack: the colors of "trivial", pixel by pixel, at two thirds of its cost,
 since it writes nothing else. It has no depth and no segmentation."""
 PREBUILT_SHADER_CONFIGS.setdefault("trivial", TRIVIAL)
 PREBUILT_SHADER_CONFIGS.setdefault("unlit", UNLIT)

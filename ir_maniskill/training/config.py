@@ -43,7 +43,7 @@ class AgentConfig:
     sees_target: bool = True
     """Whether proprioception includes the joint targets (needed by delta actions)."""
     vocabulary: int = 10
-    """Number of token ids, <pad> = 0 included."""
+    """Number of token ids, <pad> = 0 included; training takes the experiment's."""
     language_layers: int = 3
     """Transformer encoder layers."""
     language_heads: int = 2

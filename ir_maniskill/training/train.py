@@ -8,6 +8,7 @@ import math
 import os
 import time
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -16,9 +17,10 @@ from tqdm import tqdm
 from ir_maniskill.agent.agent import Agent, State, StateSpec
 from ir_maniskill.environment.state import StateStack
 from ir_maniskill.environment.vector import make_vec
+from ir_maniskill.experiment import Experiment
 from ir_maniskill.training import checkpoint, ppo
 from ir_maniskill.training.checkpoint import CheckpointError, Stored
-from ir_maniskill.training.config import TrainConfig, decode
+from ir_maniskill.training.config import Sense, TrainConfig, decode
 from ir_maniskill.training.evaluate import EvaluationReport, evaluate_policy
 from ir_maniskill.training.rollout import RewardScale, Rollout, VectorEnv, collect, to
 from ir_maniskill.training.run_folder import RunFolder
@@ -65,6 +67,14 @@ def train(
     return folder.best
 
 
+def _for_experiment(config: TrainConfig, experiment: Experiment) -> TrainConfig:
+    """Return the config with what the experiment decides: senses and vocabulary."""
+    senses = config.agent.senses or tuple(cast("tuple[Sense, ...]", experiment.senses))
+    words = len(experiment.vocabulary)
+    agent = dataclasses.replace(config.agent, senses=senses, vocabulary=words)
+    return dataclasses.replace(config, agent=agent)
+
+
 def _make_envs(config: TrainConfig) -> VectorEnv:
     return make_vec(
         config.env_id,
@@ -83,10 +93,7 @@ class Trainer:
 
     def __init__(self, config: TrainConfig, envs: VectorEnv, folder: RunFolder) -> None:
         """Make an untrained agent for these envs."""
-        if config.agent.senses is None:
-            senses = tuple(envs.experiment.senses)
-            agent = dataclasses.replace(config.agent, senses=senses)
-            config = dataclasses.replace(config, agent=agent)
+        config = _for_experiment(config, envs.experiment)
         self.config, self.envs, self.folder = config, envs, folder
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self.stack = StateStack(config.frames)
