@@ -174,9 +174,9 @@ class TrainConfig:
     reward_mode: str = "dense"
     """Reward to learn from: "sparse" is the paper's, "dense" is shaped toward touching
     the named object alone."""
-    shader_pack: str | None = "trivial"
-    """Shader pack of the cameras: "trivial" is unlit and by far the cheapest, "minimal"
-    and "default" are lit; None: the task's own."""
+    shader_pack: str | None = "unlit"
+    """Shader pack of the cameras: "unlit" paints base colors and is by far the
+    cheapest, "minimal" and "default" are lit; None: the task's own."""
     camera_height: int = 64
     """Height of each image [pixel]."""
     camera_width: int = 32
