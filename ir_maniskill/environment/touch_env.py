@@ -84,6 +84,7 @@ class TouchEnv(BaseEnv):
             experiment = catalog.get(experiment)
         self.experiment = experiment
         self.dense_weights = replace(DenseWeights(), **(dense_weights or {}))
+        self._drawing = False
         if render_backend == "auto":
             render_backend = "gpu" if torch.cuda.is_available() else "cpu"
         if render_backend not in ("none", None):
@@ -214,6 +215,7 @@ class TouchEnv(BaseEnv):
         options = dict(options or {})
         if seed is not None and not self._sim_device.is_cuda():
             options.setdefault("reconfigure", True)
+        self._drawing = False
         gym.Env.reset(self, seed=seed if isinstance(seed, int) else None)
         return super().reset(seed, options)
 
@@ -292,6 +294,28 @@ class TouchEnv(BaseEnv):
 
     def _object_position(self) -> Tensor:
         return positions(self.objects)
+
+    def _after_control_step(self) -> None:
+        # The renderer draws in the background while the rest of a step is computed.
+        pictures = self.obs_mode not in ("none", "state", "state_dict")
+        if pictures and not self._sim_device.is_cuda():
+            self.scene.update_render(
+                update_sensors=True, update_human_render_cameras=False
+            )
+            self.capture_sensor_data()
+            self._drawing = True
+
+    def _get_obs_sensor_data(self, apply_texture_transforms: bool = True) -> dict:
+        if not self._drawing:
+            return super()._get_obs_sensor_data(apply_texture_transforms)
+        self._drawing = False
+        kinds = vars(self.obs_mode_struct.visual)
+        return {
+            name: sensor.get_obs(
+                **kinds, apply_texture_transforms=apply_texture_transforms
+            )
+            for name, sensor in self.scene.sensors.items()
+        }
 
     def get_sensor_params(self) -> dict:
         """Return the cameras' matrices, computed once: no camera ever moves."""

@@ -200,6 +200,19 @@ class Nao(BaseAgent):
             ),
         }
 
+    def set_action(self, action: Tensor) -> None:
+        """Execute an action with the next control step.
+
+        Args:
+            action: As the control mode asks, in the order of `JOINTS` [N, J].
+
+        Raises:
+            ValueError: It holds NaN (checked on the CPU only).
+        """
+        if not self.scene.gpu_sim_enabled and bool(action.isnan().any()):
+            raise ValueError(f"action: got NaN, expected numbers in [-1, 1]: {action}")
+        self.controller.set_action(action)
+
     def to_qpos(self, position: Tensor) -> Tensor:
         """Reorder joint positions from the action's order to the simulator's.
 
