@@ -13,7 +13,7 @@ import numpy as np
 import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
-from mani_skill.sensors.camera import CameraConfig
+from mani_skill.sensors.camera import Camera, CameraConfig
 from mani_skill.utils.structs import Pose
 from mani_skill.utils.structs.types import SceneConfig, SimConfig
 from torch import Tensor
@@ -310,12 +310,24 @@ class TouchEnv(BaseEnv):
             return super()._get_obs_sensor_data(apply_texture_transforms)
         self._drawing = False
         kinds = vars(self.obs_mode_struct.visual)
+        sensors = self.scene.sensors
+        if apply_texture_transforms and [k for k in kinds if kinds[k]] == ["rgb"]:
+            return {name: self._fetch_color(each) for name, each in sensors.items()}
         return {
             name: sensor.get_obs(
                 **kinds, apply_texture_transforms=apply_texture_transforms
             )
-            for name, sensor in self.scene.sensors.items()
+            for name, sensor in sensors.items()
         }
+
+    def _fetch_color(self, sensor: Camera) -> dict[str, Tensor]:
+        """Return the picture that `sensor` drew, as its `get_obs` but not copied.
+
+        Torch copies even small pictures on all cores, which wait for each other.
+        """
+        (camera,) = sensor.camera._render_cameras
+        color = torch.from_numpy(camera.get_picture("Color"))[None]  # [1, H, W, 4]
+        return sensor.config.shader_config.texture_transforms["Color"](color)
 
     def get_sensor_params(self) -> dict:
         """Return the cameras' matrices, computed once: no camera ever moves."""
