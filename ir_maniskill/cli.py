@@ -1,4 +1,4 @@
-"""The command line: ``ir-maniskill tasks | train | evaluate | video | doctor``."""
+"""The command line: ``ir-maniskill tasks | train | evaluate | video | bench | ...``."""
 
 from __future__ import annotations
 
@@ -108,6 +108,18 @@ class Curve:
 
 
 @dataclasses.dataclass(frozen=True)
+class Bench:
+    """Measure how fast everything is, beside its peers, on this machine."""
+
+    json: Path | None = None
+    """File to write the figures to."""
+    seconds: float = 10.0
+    """How long each comparison goes on [s]."""
+    quick: bool = False
+    """Measure as briefly as possible, and without ManiSkill's humanoid task."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Doctor:
     """Say whether this machine can render, and what to install if not."""
 
@@ -162,6 +174,7 @@ def parse(arguments: Sequence[str]) -> Any:
         | Annotated[Evaluate, subcommand("evaluate")]
         | Annotated[Video, subcommand("video")]
         | Annotated[Curve, subcommand("curve")]
+        | Annotated[Bench, subcommand("bench")]
         | Annotated[Doctor, subcommand("doctor")]
     )
     return tyro.cli(
@@ -270,6 +283,18 @@ def _curve(command: Curve) -> int:
     return 0
 
 
+def _bench(command: Bench) -> int:
+    if not 0 < command.seconds <= 600:
+        raise UsageError(f"--seconds: got {command.seconds:g}, expected up to 600")
+    from ir_maniskill.bench import run as bench  # it loads much that others don't need
+
+    report = bench.run(command.seconds, command.quick)
+    print(report)
+    if command.json is not None:
+        bench.save(report, command.json)
+    return 0
+
+
 def _doctor(_: Doctor) -> int:
     return doctor.main([])
 
@@ -321,6 +346,7 @@ _COMMANDS: dict[type, Callable[[Any], int]] = {
     Evaluate: _evaluate,
     Video: _video,
     Curve: _curve,
+    Bench: _bench,
     Doctor: _doctor,
 }
 
