@@ -1,0 +1,44 @@
+"""The shipped policies load, say how good they are, and are."""
+
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+from ir_maniskill.training.checkpoint import load_policy
+from ir_maniskill.training.evaluate import evaluate_policy
+
+SHIPPED = sorted(Path(str(files("ir_maniskill.assets"))).glob("policies/*.safetensors"))
+
+
+def test_there_are_shipped_policies() -> None:
+    assert SHIPPED
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_a_shipped_policy_says_where_it_comes_from(path: Path) -> None:
+    _, config, facts = load_policy(path)
+    assert config.env_id == path.stem
+    assert facts["steps"] >= 2048
+    figures = facts["evaluation"]
+    assert figures["env_id"] == path.stem
+    assert figures["overall"]["episodes"] >= 200
+    assert len(figures["commit"]) == 40
+    assert path.stat().st_size < 4e6
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_a_shipped_policy_does_what_it_is_told(path: Path) -> None:
+    agent, config, _ = load_policy(path)
+    report = evaluate_policy(
+        agent.policy,
+        config.env_id,
+        episodes=6,
+        seed=3_000_000,
+        num_envs=2,
+        frames=config.frames,
+        env_kwargs=config.env_kwargs(training=False),
+    )
+    assert report.overall.success.value >= 5 / 6
+    assert report.overall.touching > 0.6
