@@ -34,7 +34,8 @@ def run(seconds: float = 10.0, quick: bool = False, shader: str = SHADER) -> Rep
     if not quick:
         peers = {
             "peer, pictures": lambda: [
-                simulation.beside_peer("rgb", shader, seconds, goal=30)
+                simulation.beside_peer("rgb", pack, seconds, goal=30)
+                for pack in ("minimal", shader)
             ],
             "peer, state": lambda: [
                 simulation.beside_peer("state", shader, seconds, goal=12)

@@ -78,10 +78,12 @@ def beside_peer(obs_mode: str, shader: str, seconds: float, goal: float) -> Meas
     ):
         blocks = {"ours": stepping(ours, EPISODE), "peer": stepping(peer, few)}
         time = in_turn(blocks, seconds)
-    pictures = f", two {SIDE} x {SIDE} pictures ({shader})" if obs_mode == "rgb" else ""
+    rgb = obs_mode == "rgb"
+    pictures = f", two {SIDE} x {SIDE} pictures" if rgb else ""
+    pack = f" ({shader})" if rgb else ""
     return Measure(
-        f"{obs_mode}_beside_peer",
-        f"steps/s, one process, {obs_mode}: ours / UnitreeG1",
+        f"{obs_mode}_beside_peer" + (f"_{shader}" if rgb else ""),
+        f"steps/s, one process, {obs_mode}{pack}: ours / UnitreeG1",
         time["peer"] / time["ours"],
         goal,
         detail=f"{_ms(time)} a step{pictures}",

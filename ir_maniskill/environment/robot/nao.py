@@ -82,7 +82,7 @@ class TargetController(PDJointPosController):
     """Joint position targets, kept within the limits, absolute or changed by a delta.
 
     Differs from its parent in two ways: a delta never winds the target up beyond a
-    joint's limit, and targets are set without per-joint tensor indexing.
+    joint's limit, and all that an action needs is computed once, where it can be.
     """
 
     config: PDJointPosControllerConfig
@@ -93,10 +93,27 @@ class TargetController(PDJointPosController):
         self.lower, self.upper = limits.unbind(-1)  # [J] [rad]
         self._physx_joints = [joint._objs[0] for joint in self.joints]
 
+    def _clip_and_scale_action_space(self) -> None:
+        super()._clip_and_scale_action_space()
+        low, high = self.action_space_low, self.action_space_high  # [J] [rad]
+        self._action_middle, self._action_scale = 0.5 * (high + low), 0.5 * (high - low)
+
+    def _clip_and_scale_action(self, action: Tensor) -> Tensor:
+        return self._action_middle + self._action_scale * action.clamp(-1, 1)
+
     @property
     def target(self) -> Tensor:
         """Current joint position targets [N, J] [rad]."""
         return self._target_qpos
+
+    def set_action(self, action: Tensor) -> None:
+        """Set the targets, or change them if the config says `use_delta`.
+
+        Args:
+            action: In the order of `config.joint_names` [N, J] in [-1, 1].
+        """
+        angle = self._preprocess_action(action)
+        self.set_drive_targets(self.target + angle if self.config.use_delta else angle)
 
     def set_drive_targets(self, targets: Tensor) -> None:
         """Send targets to the simulator.
