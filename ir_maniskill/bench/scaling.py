@@ -19,7 +19,7 @@ from ir_maniskill.bench.run import SHADER
 from ir_maniskill.bench.simulation import OURS
 from ir_maniskill.bench.timing import timed
 from ir_maniskill.environment.process_vector import ProcessVectorEnv
-from ir_maniskill.experiment import COLORS, Experiment, Instruction, TouchObject
+from ir_maniskill.experiment import COLORS, Experiment, Instruction, Jitter, TouchObject
 
 ENVS = (1, 2, 4, 8, 16)
 SIZES = ((64, 32), (128, 64), (128, 128), (256, 128), (512, 256))
@@ -84,12 +84,18 @@ def point(
 def with_objects(count: int) -> Experiment:
     """Return an experiment with this many cubes in one or two lines."""
     colors = list(COLORS)[:count]
-    places = [(x, y) for x in (0.19, 0.25) for y in (-0.08, 0.0, 0.08)]
+    places = [(x, y) for x in (0.17, 0.23) for y in (-0.08, 0.0, 0.08)]
     cubes = tuple(map(TouchObject, colors, places))
     sentence = Instruction("Touch the blue cube.", cubes[0].name)
     base = catalog.get(OURS)
     name = f"Cubes{count}-v1"
-    return replace(base, id=name, objects=cubes, instructions=(sentence,))
+    return replace(
+        base,
+        id=name,
+        objects=cubes,
+        instructions=(sentence,),
+        jitter=Jitter(position=0.0, yaw=0.0),  # so that six fit into reach
+    )
 
 
 def draw(curves: dict[str, list[Point]], out: Path) -> None:
