@@ -84,7 +84,6 @@ class TouchEnv(BaseEnv):
             experiment = catalog.get(experiment)
         self.experiment = experiment
         self.dense_weights = replace(DenseWeights(), **(dense_weights or {}))
-        self._drawing = False
         if render_backend == "auto":
             render_backend = "gpu" if torch.cuda.is_available() else "cpu"
         if render_backend not in ("none", None):
@@ -215,7 +214,6 @@ class TouchEnv(BaseEnv):
         options = dict(options or {})
         if seed is not None and not self._sim_device.is_cuda():
             options.setdefault("reconfigure", True)
-        self._drawing = False
         gym.Env.reset(self, seed=seed if isinstance(seed, int) else None)
         return super().reset(seed, options)
 
@@ -295,30 +293,15 @@ class TouchEnv(BaseEnv):
     def _object_position(self) -> Tensor:
         return positions(self.objects)
 
-    def _after_control_step(self) -> None:
-        # The renderer draws in the background while the rest of a step is computed.
-        pictures = self.obs_mode not in ("none", "state", "state_dict")
-        if pictures and not self._sim_device.is_cuda():
-            self.scene.update_render(
-                update_sensors=True, update_human_render_cameras=False
-            )
-            self.capture_sensor_data()
-            self._drawing = True
-
     def _get_obs_sensor_data(self, apply_texture_transforms: bool = True) -> dict:
-        if not self._drawing:
-            return super()._get_obs_sensor_data(apply_texture_transforms)
-        self._drawing = False
         kinds = vars(self.obs_mode_struct.visual)
-        sensors = self.scene.sensors
-        if apply_texture_transforms and [k for k in kinds if kinds[k]] == ["rgb"]:
-            return {name: self._fetch_color(each) for name, each in sensors.items()}
-        return {
-            name: sensor.get_obs(
-                **kinds, apply_texture_transforms=apply_texture_transforms
-            )
-            for name, sensor in sensors.items()
-        }
+        colors_only = [kind for kind in kinds if kinds[kind]] == ["rgb"]
+        if self._sim_device.is_cuda() or not (colors_only and apply_texture_transforms):
+            return super()._get_obs_sensor_data(apply_texture_transforms)
+        self.scene.update_render(update_sensors=True, update_human_render_cameras=False)
+        self.capture_sensor_data()
+        sensors = self.scene.sensors.items()
+        return {name: self._fetch_color(sensor) for name, sensor in sensors}
 
     def _fetch_color(self, sensor: Camera) -> dict[str, Tensor]:
         """Return the picture that `sensor` drew, as its `get_obs` but not copied.
