@@ -190,6 +190,15 @@ def test_observation_modes(mode: str) -> None:
     env.close()
 
 
+def test_pictures_that_a_shader_pack_cannot_draw_are_refused() -> None:
+    with pytest.raises(ValueError, match="'rgbd', but the shader pack of .* only rgb;"):
+        gym.make(
+            "NaoTouchCubeSingle-v1",
+            obs_mode="rgbd",
+            sensor_configs={"width": 32, "height": 64, "shader_pack": "unlit"},
+        )
+
+
 def test_unknown_ids_and_modes_are_refused() -> None:
     with pytest.raises(gym.error.NameNotFound):
         gym.make("NaoTouchCubeSolo-v1")

@@ -128,6 +128,15 @@ class TouchEnv(BaseEnv):
         sapien.render.set_picture_format("Color", "r8g8b8a8unorm")
         super()._setup_sensors(options)
         self._sensor_params: dict | None = None
+        wanted = {kind for kind, on in vars(self.obs_mode_struct.visual).items() if on}
+        for name, sensor in self._sensors.items():
+            pack = sensor.config.shader_config
+            drawn = {kind for kinds in pack.texture_names.values() for kind in kinds}
+            if not wanted <= drawn:
+                raise ValueError(
+                    f"obs_mode: got {self.obs_mode!r}, but the shader pack of {name} "
+                    f"draws only {', '.join(sorted(drawn))}; choose another shader_pack"
+                )
 
     def _after_reconfigure(self, options: dict) -> None:
         self.instructional_set = InstructionalSet(self.experiment, self.device)
