@@ -22,7 +22,6 @@ from ir_maniskill import experiment as catalog
 from ir_maniskill.doctor import require_vulkan
 from ir_maniskill.environment import reward_generator, table_scene
 from ir_maniskill.environment.bodies import positions
-from ir_maniskill.environment.contacts import contact_query
 from ir_maniskill.environment.instructional_set import InstructionalSet
 from ir_maniskill.environment.reward_generator import DenseWeights, FingerCount
 from ir_maniskill.environment.robot.nao import Nao
@@ -140,9 +139,7 @@ class TouchEnv(BaseEnv):
 
     def _after_reconfigure(self, options: dict) -> None:
         self.instructional_set = InstructionalSet(self.experiment, self.device)
-        self._contact_force = contact_query(
-            self.scene, self.agent.finger_links, self.objects
-        )
+        self._contact_force = self.agent.touch_query(self.objects)
         things = self.experiment.objects
         heights = [table_scene.OBJECT_HEIGHT[thing.shape] for thing in things]
         self._places = np.array([thing.position for thing in things])  # [C, 2] [m]

@@ -7,6 +7,7 @@ Legend: N envs, J joints (26), F fingers (6).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from xml.etree import ElementTree
@@ -20,10 +21,11 @@ from mani_skill.agents.controllers import (
     PDJointPosControllerConfig,
 )
 from mani_skill.agents.registration import register_agent
-from mani_skill.utils.structs import Link
+from mani_skill.utils.structs import Actor, Link
 from torch import Tensor
 
 from ir_maniskill.environment.bodies import positions
+from ir_maniskill.environment.contacts import ContactQuery, contact_query
 
 # -- Joints: the action's order, all left then all right --------------------------
 
@@ -258,6 +260,14 @@ class Nao(BaseAgent):
             "proprioception": self._normalize(self.robot.get_qpos()[:, self._order]),
             "target": self._normalize(self.controller.target),
         }
+
+    def touch_query(self, objects: Sequence[Actor]) -> ContactQuery:
+        """Return a query for the force of each finger on each object [N, F, C] [N].
+
+        Args:
+            objects: What the fingers may touch; anything else is not felt.
+        """
+        return contact_query(self.scene, self.finger_links, objects)
 
     def joint_velocity(self) -> Tensor:
         """Return joint velocities in the action's order [N, J] [rad/s]."""
