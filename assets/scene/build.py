@@ -1,7 +1,6 @@
 """Builds `room.glb` and `button.glb`: `python -m ir_maniskill.assets.scene.build`.
 
-The room (table, floor, wall) is one mesh with one material, hence one draw call. The
-table's measures are those of the experiments and of the scene's collision box.
+The room (table, floor, wall) is one mesh with one material, hence one draw call.
 """
 
 from pathlib import Path
@@ -11,11 +10,14 @@ import trimesh
 
 from ir_maniskill.assets.nao import SOLE_HEIGHT
 from ir_maniskill.assets.nao.shapes import Surface, bake, join, knob
+from ir_maniskill.environment.table_scene import TABLE_THICKNESS, TABLE_TOP
+from ir_maniskill.experiment import TABLE
 
 FOLDER = Path(__file__).parent
 
-TABLE_X, TABLE_Y, TABLE_Z = (0.10, 0.40), (-0.34, 0.34), (0.01, 0.03)
-"""Extents of the table top [m]."""
+TABLE_X, TABLE_Y = TABLE
+TABLE_Z = (TABLE_TOP - TABLE_THICKNESS, TABLE_TOP)
+"""Extents of the table top [m], those of its collision box."""
 LEG_WIDTH = 0.03
 """Edge of a table leg [m]."""
 ROOM_X, ROOM_Y, ROOM_HEIGHT = (-0.8, 1.2), (-3.2, 3.2), 1.8
