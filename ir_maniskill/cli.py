@@ -18,7 +18,7 @@ from tyro.conf import Positional, arg, subcommand
 from ir_maniskill import doctor
 from ir_maniskill import experiment as catalog
 from ir_maniskill.experiment import Experiment
-from ir_maniskill.training import plots, video
+from ir_maniskill.training import distributed, plots, video
 from ir_maniskill.training.checkpoint import load_policy
 from ir_maniskill.training.config import CONFIGS, TrainConfig
 from ir_maniskill.training.evaluate import evaluate_policy, write_report
@@ -220,9 +220,11 @@ def _train(command: Train) -> int:
     config = TrainConfig(**numbers)
     catalog.get(config.env_id)
     config = dataclasses.replace(config, out=config.out or f"runs/{config.env_id}")
-    best = train(config, resume=command.resume)
-    print(f"The best policy is in {best}.")
-    print(f"Next: ir-maniskill evaluate {config.env_id} --checkpoint {best}")
+    with distributed.group():
+        best = train(config, resume=command.resume)
+        if distributed.rank() == 0:
+            print(f"The best policy is in {best}.")
+            print(f"Next: ir-maniskill evaluate {config.env_id} --checkpoint {best}")
     return 0
 
 

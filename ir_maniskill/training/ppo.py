@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ir_maniskill.agent.agent import Agent
+from ir_maniskill.training import distributed
 from ir_maniskill.training.config import PPOConfig
 from ir_maniskill.training.finite import check_finite
 from ir_maniskill.training.rollout import Batch, Rollout
@@ -28,12 +29,14 @@ def update(
             check_finite(terms, "loss", "the learning rate is too high")
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
+            distributed.average_gradients(agent)
             terms["gradient"] = clip_gradient(agent, config.max_grad_norm)
             optimizer.step()
             for name, term in terms.items():
                 history[name].append(term)
-        means = {name: torch.stack(terms).mean() for name, terms in history.items()}
-        figures = {name: float(mean) for name, mean in means.items()}
+        means = torch.stack([torch.stack(terms).mean() for terms in history.values()])
+        means = distributed.gather(means[None]).mean(dim=0)  # all ranks stop alike
+        figures = dict(zip(history, means.tolist(), strict=True))
         figures["epochs"] = epoch + 1
         if config.max_kl is not None and figures["kl"] > config.max_kl:
             break
@@ -44,9 +47,13 @@ def update(
 
 
 def minibatches(rollout: Rollout, config: PPOConfig) -> Iterator[Tensor]:
-    """Yield the flat indices of all steps [B], shuffled, in equal parts."""
+    """Yield the flat indices of all steps [B], shuffled, in equal parts.
+
+    A minibatch is shared by the ranks, each drawing from its own steps.
+    """
     total = rollout.steps * rollout.num_envs
-    parts = max(1, round(total / (config.minibatch or total)))
+    joined = total * distributed.size()
+    parts = max(1, round(joined / (config.minibatch or joined)))
     yield from torch.randperm(total).to(rollout.reward.device).tensor_split(parts)
 
 
@@ -79,8 +86,9 @@ def ppo_loss(
 
 
 def normalize(advantage: Tensor) -> Tensor:
-    """Return the advantages with mean 0 and standard deviation 1."""
-    return (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-8)
+    """Return the advantages with mean 0 and standard deviation 1 over all ranks."""
+    joined = distributed.gather(advantage)
+    return (advantage - joined.mean()) / (joined.std(correction=0) + 1e-8)
 
 
 def clip_gradient(agent: Agent, max_norm: float | None) -> Tensor:
@@ -99,5 +107,6 @@ def clip_gradient(agent: Agent, max_norm: float | None) -> Tensor:
 
 def explained_variance(rollout: Rollout) -> float:
     """Return the share of the returns' variance that the critic foresaw (1: all)."""
-    variance = rollout.returns.var()
-    return float(1 - rollout.advantage.var() / variance) if variance > 0 else 0.0
+    returns, missed = map(distributed.gather, (rollout.returns, rollout.advantage))
+    variance = returns.var()
+    return float(1 - missed.var() / variance) if variance > 0 else 0.0

@@ -1,6 +1,6 @@
 """Roll-outs: what the agent lived through, kept for one update."""
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any
 
 import torch
@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ir_maniskill.agent.agent import Act, Agent, State
 from ir_maniskill.environment.vector import GpuVectorEnv, ProcessVectorEnv
+from ir_maniskill.training import distributed
 from ir_maniskill.training.config import PPOConfig
 from ir_maniskill.training.finite import check_finite
 
@@ -177,7 +178,7 @@ class RewardScale:
             returns[t] = running = self.gamma * running + reward[t]
             running = running * ~done[t]
         self.running = running
-        self._update(returns.double().flatten())
+        self._update(distributed.gather(returns.double().flatten()))
         return reward / (self.variance**0.5 + 1e-8)
 
     def restart(self) -> None:
@@ -232,6 +233,11 @@ class EpisodeSums:
         self.exclusive += int(info["exclusive_success"][done].sum())
         self.touching += int((info["right_fingers"] > 0).sum())
         self.wrong += int((info["wrong_fingers"] > 0).sum())
+
+    def over_ranks(self) -> "EpisodeSums":
+        """Return the sums over the envs of all ranks."""
+        sums = torch.tensor(astuple(self), dtype=torch.float64)
+        return EpisodeSums(*distributed.gather(sums[None]).sum(dim=0).tolist())
 
     def means(self) -> dict[str, float]:
         """Return the figures per step and per episode."""

@@ -5,7 +5,6 @@ import dataclasses
 import json
 import logging
 import math
-import os
 import time
 from pathlib import Path
 from typing import cast
@@ -18,9 +17,10 @@ from ir_maniskill.agent.agent import Agent, State, StateSpec
 from ir_maniskill.environment.state import StateStack
 from ir_maniskill.environment.vector import make_vec
 from ir_maniskill.experiment import Experiment
-from ir_maniskill.training import checkpoint, ppo
+from ir_maniskill.training import checkpoint, distributed, ppo
 from ir_maniskill.training.checkpoint import CheckpointError, Stored
-from ir_maniskill.training.config import Sense, TrainConfig, decode
+from ir_maniskill.training.config import ConfigError, Sense, TrainConfig, decode
+from ir_maniskill.training.distributed import RankError
 from ir_maniskill.training.evaluate import EvaluationReport, evaluate_policy
 from ir_maniskill.training.rollout import RewardScale, Rollout, VectorEnv, collect, to
 from ir_maniskill.training.run_folder import RunFolder
@@ -42,7 +42,8 @@ def train(
 ) -> Path:
     """Train an agent and return the file of its best policy.
 
-    Ctrl-C keeps a checkpoint of the last complete update and leaves.
+    Ctrl-C keeps a checkpoint of the last complete update and leaves. Where torchrun
+    started several processes, each trains on its share of the envs.
 
     Args:
         config: task, learner, budget and folder.
@@ -51,17 +52,23 @@ def train(
 
     Raises:
         CheckpointError: if the folder or its checkpoint cannot be used.
+        ConfigError: if the envs cannot be shared evenly among the ranks.
+        RankError: if another rank failed.
         TrainingDivergedError: if a number stopped being finite.
     """
-    folder = RunFolder(Path(config.out), resume=resume)
     with contextlib.ExitStack() as leaving:
+        leaving.enter_context(distributed.group())
+        _require_shares(config)
+        folder = distributed.from_first(
+            lambda: RunFolder(Path(config.out), resume=resume)
+        )
         leaving.callback(folder.close)
         leaving.callback(torch.set_num_threads, torch.get_num_threads())
         if envs is None:
             envs = _make_envs(config)
             leaving.callback(envs.close)
         trainer = Trainer(config, envs, folder)
-        if resume and folder.last.exists():
+        if distributed.from_first(lambda: resume and folder.last.exists()):
             trainer.restore()
         trainer.learn()
     return folder.best
@@ -75,12 +82,31 @@ def _for_experiment(config: TrainConfig, experiment: Experiment) -> TrainConfig:
     return dataclasses.replace(config, agent=agent)
 
 
+def _require_shares(config: TrainConfig) -> None:
+    """Raise unless every rank gets equal parts of the envs and of each minibatch."""
+    ranks, minibatch = distributed.size(), config.ppo.minibatch
+    if config.num_envs % ranks:
+        raise ConfigError(
+            f"num_envs: got {config.num_envs}, expected a multiple of {ranks}: the "
+            "ranks share them"
+        )
+    if minibatch is not None and minibatch < ranks:
+        raise ConfigError(
+            f"minibatch: got {minibatch}, expected at least {ranks}: the ranks share it"
+        )
+
+
 def _make_envs(config: TrainConfig) -> VectorEnv:
+    """Make this rank's envs, on its device."""
+    device, kwargs = distributed.device(), config.env_kwargs(training=True)
+    if device.index is not None:
+        kwargs["render_backend"] = f"sapien_{device}"
     return make_vec(
         config.env_id,
-        config.num_envs,
-        num_workers=config.num_workers,
-        **config.env_kwargs(training=True),
+        config.num_envs // distributed.size(),
+        num_workers=config.num_workers or distributed.cores(),
+        sim_backend=f"physx_{device}",
+        **kwargs,
     )
 
 
@@ -89,22 +115,25 @@ class Trainer:
 
     Scenes are reseeded from (seed, steps) at the start and after every checkpoint, so
     that a run resumed there meets the same scenes as one that was never interrupted.
+    Several ranks have the scenes of one with all envs. The first one's random states
+    are in the checkpoint; the others draw anew from (seed, steps, rank) after it.
     """
 
     def __init__(self, config: TrainConfig, envs: VectorEnv, folder: RunFolder) -> None:
         """Make an untrained agent for these envs."""
         config = _for_experiment(config, envs.experiment)
         self.config, self.envs, self.folder = config, envs, folder
-        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        self.device = distributed.device()
         self.stack = StateStack(config.frames)
         torch.manual_seed(config.seed)
         torch.set_num_threads(1)  # orthogonal weights depend on it in their last bits
         self.steps, self.best_score = 0, -math.inf
-        self.reward_scale = RewardScale(config.num_envs, config.ppo.gamma)
+        self.reward_scale = RewardScale(envs.num_envs, config.ppo.gamma)
         self.state = self._fresh_scenes()
         actions = math.prod(envs.single_action_space.shape or ())
         spec = StateSpec.of(self.state, actions)
         self.agent = Agent(config.agent, spec).to(self.device)
+        distributed.copy_from_first(self.agent)
         rate = config.ppo.learning_rate
         self.optimizer = torch.optim.Adam(self.agent.parameters(), rate, eps=1e-5)
         self.rollout = Rollout(config.steps_per_env, self.state, actions)
@@ -113,11 +142,13 @@ class Trainer:
         """Train until the steps are used up or the goal is reached."""
         size = self.config.steps_per_update
         total = math.ceil(self.config.total_steps / size) * size
-        self.folder.begin(self.config, self.steps)
+        distributed.from_first(lambda: self.folder.begin(self.config, self.steps))
         snapshot = self.snapshot()
-        checkpoint.write(self.folder.last, snapshot)  # shows at once that we can
-        reached = False
-        with tqdm(total=total, initial=self.steps, unit=" steps") as bar:
+        self._write(snapshot)  # shows at once that we can
+        reached, silent = False, distributed.rank() > 0
+        with tqdm(
+            total=total, initial=self.steps, unit=" steps", disable=silent
+        ) as bar:
             try:
                 while self.steps < total and not reached:
                     figures = self.update()
@@ -125,15 +156,16 @@ class Trainer:
                     bar.set_postfix_str(_summary(figures))
                     bar.update(size)
                     if self._due(self.config.eval_interval) or self.steps >= total:
-                        reached = self._reached(self.evaluate())
+                        reached = self._reached(distributed.from_first(self.evaluate))
                         self.save()  # the evaluation left the scenes in disorder
                     elif self._due(self.config.checkpoint_interval):
                         self.save()
-            except KeyboardInterrupt:
-                checkpoint.write(self.folder.last, snapshot)
-                log.warning("stopped at step %d: resume goes on there", self.steps)
+            except (KeyboardInterrupt, RankError):
+                if not silent:
+                    checkpoint.write(self.folder.last, snapshot)
+                    log.warning("stopped at step %d: resume goes on there", self.steps)
                 raise
-        self.confirm()
+        distributed.from_first(self.confirm)
 
     def update(self) -> dict[str, float]:
         """Collect roll-outs and improve the agent on them."""
@@ -151,18 +183,21 @@ class Trainer:
             last_value = self.agent.value(self.state)
         self.rollout.finish(last_value, config.ppo.gamma, config.ppo.gae_lambda)
         collected = time.perf_counter()
-        torch.set_num_threads(config.threads or _cores())
+        torch.set_num_threads(config.threads or distributed.cores())
         figures = ppo.update(self.agent, self.optimizer, self.rollout, config.ppo)
         if "privileged" in self.rollout.state:
-            self.agent.observe(self.rollout.state["privileged"].flatten(0, 1))
+            seen = distributed.gather(self.rollout.state["privileged"].flatten(0, 1))
+            self.agent.observe(seen)
         self.steps += config.steps_per_update
         done = time.perf_counter()
         figures = {f"loss/{name}": value for name, value in figures.items()}
         figures["std"] = float(self.agent.actor.log_std.exp().mean())
         figures["time/collect"] = collected - start  # [s]
         figures["time/update"] = done - collected  # [s]
-        figures = {f"train/{k}": v for k, v in sums.means().items()} | figures
-        self.folder.log("metrics", self.steps, figures)
+        means = sums.over_ranks().means()
+        figures = {f"train/{k}": v for k, v in means.items()} | figures
+        if distributed.rank() == 0:
+            self.folder.log("metrics", self.steps, figures)
         return figures
 
     def evaluate(self) -> dict[str, float]:
@@ -203,8 +238,12 @@ class Trainer:
 
     def save(self) -> None:
         """Write a complete checkpoint, and go on with fresh scenes as a resumed run."""
-        checkpoint.write(self.folder.last, self.snapshot())
+        self._write(self.snapshot())
         self.state = self._fresh_scenes()
+
+    def _write(self, snapshot: Stored) -> None:
+        """Write the first rank's snapshot as the last checkpoint."""
+        distributed.from_first(lambda: checkpoint.write(self.folder.last, snapshot))
 
     def restore(self) -> None:
         """Go on from the folder's last checkpoint.
@@ -213,7 +252,7 @@ class Trainer:
             CheckpointError: if it is broken, or of another task or config.
         """
         path = self.folder.last
-        stored = checkpoint.read(path)
+        stored = distributed.from_first(lambda: checkpoint.read(path))
         if stored.kind != checkpoint.CHECKPOINT:
             raise CheckpointError(
                 f"{path}: got a policy, expected a complete checkpoint to resume from"
@@ -258,7 +297,7 @@ class Trainer:
             self.config.env_id,
             episodes=episodes,
             seed=self.config.eval_seed if seed is None else seed,
-            num_envs=self.config.num_envs,
+            num_envs=self.envs.num_envs,
             frames=self.config.frames,
             env_kwargs=self.config.env_kwargs(training=True),
             envs=self.envs,
@@ -274,10 +313,12 @@ class Trainer:
 
     def _fresh_scenes(self) -> State:
         """Start new episodes whose scenes follow from (seed, steps) alone."""
-        entropy = np.random.SeedSequence([self.config.seed, self.steps])
+        rank = distributed.rank()
+        if rank > 0:
+            torch.manual_seed(_entropy(self.config.seed, self.steps, rank))
         # Half of the seeds, apart from those that evaluations are pinned to.
-        seed = 2**30 + int(entropy.generate_state(1)[0]) % 2**29
-        obs, _ = self.envs.reset(seed=seed)
+        seed = 2**30 + _entropy(self.config.seed, self.steps) % 2**29
+        obs, _ = self.envs.reset(seed=seed + rank * self.envs.num_envs)
         self.reward_scale.restart()
         return to(self.stack.reset(obs), self.device)
 
@@ -312,8 +353,6 @@ def _summary(figures: dict[str, float]) -> str:
     return f"return {reward:.2f}, success {success:.0%}"
 
 
-def _cores() -> int:
-    """Return how many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+def _entropy(*numbers: int) -> int:
+    """Return a seed that mixes the numbers."""
+    return int(np.random.SeedSequence(numbers).generate_state(1)[0])
