@@ -14,6 +14,7 @@ import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import Camera, CameraConfig
+from mani_skill.utils import common
 from mani_skill.utils.structs import Pose
 from mani_skill.utils.structs.types import SceneConfig, SimConfig
 from torch import Tensor
@@ -369,7 +370,11 @@ class TouchEnv(BaseEnv):
         return state
 
     def set_state_dict(self, state: dict, env_idx: Tensor | None = None) -> None:
-        """Restore what `get_state_dict` returned, for all envs or for `env_idx`."""
+        """Restore what `get_state_dict` returned, for all envs or for `env_idx`.
+
+        A row of a recorded trajectory will do: arrays, without the dimension of envs.
+        """
+        state = common.to_tensor(state, device=self.device)
         super().set_state_dict(state, env_idx)
         rows = slice(None) if env_idx is None else env_idx
         if "controller" in state:
