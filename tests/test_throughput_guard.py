@@ -17,8 +17,8 @@ import torch
 from ir_maniskill.environment import table_scene
 
 CAMERAS = 2
-PARTS = 31  # draw calls for each picture: 27 links, the room, three objects
-TRIANGLES = 3_200
+PARTS = 25  # draw calls for each picture: 21 of the robot, the room, three objects
+TRIANGLES = 1_650
 PYTHON_CALLS = 125  # of Python functions in one step with pictures, 103 when written
 SUBSTEPS = 5
 PIPE_BYTES = 200  # for one worker and one step, there and back

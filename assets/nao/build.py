@@ -63,13 +63,9 @@ _PHALANX_SHAPES = tuple(
     Ball((PHALANX_PITCH * share, 0, 0), PHALANX_RADIUS) for share in (0.25, 0.75)
 )
 
-_ARM_MESHES = {
-    "Shoulder": "shoulder",
-    "Bicep": "bicep",
-    "Elbow": "elbow",
-    "ForeArm": "forearm",
-    "_wrist": "hand",
-}
+# The links between have no look of their own: shoulder, elbow and forearm are round
+# about a joint's axis, so that the link on its other side can carry their surface.
+_ARM_MESHES = {"Bicep": "bicep", "_wrist": "hand"}
 
 _FINGERTIPS = ("Finger13_link", "Finger23_link", "Thumb2_link")
 
@@ -160,12 +156,13 @@ def _is_finger(link: str) -> bool:
     return "Finger" in link or "Thumb" in link
 
 
-def _mesh_of(link: str) -> str:
+def _mesh_of(link: str) -> str | None:
     if link == ROOT:
         return "torso"
     if _is_finger(link):
         return "fingertip" if link[1:] in _FINGERTIPS else "phalanx"
-    return f"{link[0].lower()}_{_ARM_MESHES[link[1:]]}"
+    name = _ARM_MESHES.get(link[1:])
+    return name and f"{link[0].lower()}_{name}"
 
 
 def _shapes_of(link: str) -> tuple[Shape, ...]:
@@ -185,9 +182,9 @@ def _mirrored(shape: Shape) -> Shape:
 def _link(name: str, inertial: Inertial) -> ET.Element:
     link = ET.Element("link", name=name)
     link.append(_inertial(inertial))
-    visual = ET.SubElement(link, "visual")
-    geometry = ET.SubElement(visual, "geometry")
-    ET.SubElement(geometry, "mesh", filename=f"meshes/{_mesh_of(name)}.glb")
+    if mesh := _mesh_of(name):
+        geometry = ET.SubElement(ET.SubElement(link, "visual"), "geometry")
+        ET.SubElement(geometry, "mesh", filename=f"meshes/{mesh}.glb")
     link.extend(_collision(shape) for shape in _shapes_of(name))
     return link
 

@@ -45,13 +45,7 @@ def parts(frames: Frames) -> dict[str, Part]:
     Args:
         frames: Frame of every link in the torso's, in the posture to be merged.
     """
-    arm = {
-        "shoulder": shoulder(),
-        "bicep": bicep(),
-        "elbow": elbow(),
-        "forearm": forearm(),
-        "hand": hand(),
-    }
+    arm = {"bicep": bicep(), "hand": hand()}
     meshes = {"torso": Part(body(frames), _BODY_LIGHT)}
     for name, surface in arm.items():
         meshes[f"l_{name}"] = Part(surface, _BODY_LIGHT)
@@ -62,8 +56,9 @@ def parts(frames: Frames) -> dict[str, Part]:
 
 
 def body(frames: Frames) -> Surface:
-    """Returns all that never moves, in the torso's frame."""
-    pieces = [torso(), head().moved(frames["Head"])]
+    """Returns all that never moves, and the shoulders, in the torso's frame."""
+    shoulder = drum().shifted(0, 0.098, 0.1)
+    pieces = [torso(), head().moved(frames["Head"]), shoulder, shoulder.mirrored()]
     for link, surface in (("Thigh", thigh()), ("Tibia", shin()), ("_ankle", foot())):
         left, right = ("l", "r") if link[0] == "_" else ("L", "R")
         pieces.append(surface.moved(frames[left + link]))
@@ -73,52 +68,51 @@ def body(frames: Frames) -> Surface:
 
 def torso() -> Surface:
     """Returns the trunk with neck, chest button and sonars."""
-    button = knob(
-        [SHELL, GREY, GLOW],
-        [(0, 0.017), (0.005, 0.0145), (0.006, 0.0095)],
-        segments=10,
-    ).shifted(0.051, 0, 0.055)
-    sonar = _spot(DARK, 0.0085, segments=8).turned(0, 0.06, 0.3)
+    button = knob([GREY, GLOW], [(0, 0.0165), (0.006, 0.0105)], segments=8)
+    sonar = _spot(DARK, 0.0085, segments=6).turned(0, 0.06, 0.3)
     sonar = sonar.shifted(0.0525, 0.023, 0.018)
     neck = loft(
         "z",
         GREY,
         [Section(0.114, (0.022, 0.022)), Section(0.138, (0.019, 0.019))],
-        segments=8,
+        segments=6,
         caps="none",
     )
-    return join([_trunk(), neck, button, sonar, sonar.mirrored()])
+    return join(
+        [_trunk(), neck, button.shifted(0.0515, 0, 0.055), sonar, sonar.mirrored()]
+    )
 
 
 def _trunk() -> Surface:
     shell = loft(
         "z",
-        [GREY, GREY, WHITE, WHITE, WHITE, WHITE, WHITE, WHITE],
+        [GREY, WHITE, WHITE, WHITE, WHITE],
         [
-            Section(-0.122, (0.028, 0.034), power=2.4),
-            Section(-0.104, (0.040, 0.046), power=2.4),
-            Section(-0.076, (0.046, 0.056), power=2.4),
-            Section(-0.042, (0.044, 0.052), power=2.3),
-            Section(-0.004, (0.049, 0.061), power=2.3),
-            Section(0.040, (0.054, 0.072), power=2.3),
-            Section(0.082, (0.053, 0.075), power=2.3),
-            Section(0.108, (0.043, 0.063), power=2.2),
+            Section(-0.122, (0.030, 0.036), power=2.4),
+            Section(-0.080, (0.046, 0.056), power=2.4),
+            Section(-0.036, (0.045, 0.053), power=2.3),
+            Section(0.036, (0.054, 0.072), power=2.3),
+            Section(0.092, (0.050, 0.072), power=2.3),
             Section(0.121, (0.025, 0.034)),
         ],
-        segments=16,
+        segments=12,
+        caps="low",
     )
     flank = shell.painted(
-        ORANGE, lambda c: (abs(c[1]) > 0.044) & (c[2] > -0.03) & (c[2] < 0.09)
+        ORANGE,
+        lambda c: (abs(c[1]) > 1.3 * abs(c[0])) & (c[2] > -0.03) & (c[2] < 0.09),
     )
-    return flank.painted(
-        SHELL,
-        lambda c: (c[0] < -0.03) & (abs(c[1]) < 0.035) & (c[2] > 0) & (c[2] < 0.09),
-    )
+    return flank.painted(SHELL, lambda c: _behind(c) & (c[2] > -0.03) & (c[2] < 0.09))
+
+
+def _behind(middles: np.ndarray) -> np.ndarray:
+    """Returns which cells face the back of what is round about the z axis."""
+    return (middles[0] < 0) & (abs(middles[1]) < 1.2 * abs(middles[0]))
 
 
 def head() -> Surface:
     """Returns the round head with eyes, ears, cameras and touch sensors."""
-    camera = knob([SHELL, BLACK], [(0, 0.0075), (0.003, 0.0055)], 8)
+    camera = _spot(BLACK, 0.0062, segments=6)
     return join(
         [
             _skull(),
@@ -127,8 +121,8 @@ def head() -> Surface:
             _ear(),
             _ear().mirrored(),
             _crown(),
-            camera.turned(0, -0.35, 0).shifted(0.0585, 0, 0.0790),
-            camera.turned(0, 0.6, 0).shifted(0.0535, 0, 0.0180),
+            camera.turned(0, -0.35, 0).shifted(0.0600, 0, 0.0790),
+            camera.turned(0, 0.6, 0).shifted(0.0550, 0, 0.0180),
         ]
     )
 
@@ -138,38 +132,34 @@ def _skull() -> Surface:
         "z",
         WHITE,
         [
-            Section(-0.008, (0.024, 0.026)),
-            Section(0.003, (0.044, 0.046), power=2.2),
-            Section(0.024, (0.058, 0.060), power=2.3),
-            Section(0.050, (0.0625, 0.0645), power=2.3),
-            Section(0.076, (0.059, 0.060), power=2.3),
-            Section(0.097, (0.043, 0.044), power=2.2),
-            Section(0.109, (0.021, 0.022)),
+            Section(-0.005, (0.020, 0.021)),
+            Section(0.020, (0.057, 0.059), power=2.3),
+            Section(0.050, (0.0630, 0.0650), power=2.3),
+            Section(0.079, (0.058, 0.059), power=2.3),
+            Section(0.101, (0.038, 0.039), power=2.2),
             Section(0.112, (0, 0)),
         ],
-        segments=16,
+        segments=12,
         caps="none",
     )
-    return skull.painted(
-        ORANGE, lambda c: (c[0] < -0.03) & (abs(c[1]) < 0.03) & (c[2] > 0.03)
-    )
+    return skull.painted(ORANGE, lambda c: _behind(c) & (c[2] > 0.03) & (c[2] < 0.1))
 
 
 def _eye() -> Surface:
     eye = knob(
         [BLACK, CYAN, BLACK],
         [(0, 0.0190), (0.0045, 0.0168), (0.0060, 0.0098)],
-        segments=12,
+        segments=10,
     )
-    highlight = _spot(GLOW, 0.0030, segments=5).shifted(0.0065, -0.0035, 0.0045)
+    highlight = _spot(GLOW, 0.0032, segments=4).shifted(0.0065, -0.0035, 0.0045)
     return join([eye, highlight]).turned(0, -0.04, 0.48).shifted(0.0535, 0.0280, 0.0485)
 
 
 def _ear() -> Surface:
     disc = knob(
         [SHELL, GREY, WHITE],
-        [(0, 0.030), (0.0095, 0.0275), (0.0110, 0.0200)],
-        segments=12,
+        [(0, 0.030), (0.0095, 0.0280), (0.0110, 0.0205)],
+        segments=8,
     )
     return disc.turned(0, 0, np.pi / 2).shifted(-0.006, 0.0585, 0.050)
 
@@ -180,53 +170,46 @@ def _crown() -> Surface:
         "x",
         [GREY, DARK, GREY],
         [
-            Section(-0.036, (0.009, 0.004), (0, 0.0985)),
-            Section(-0.014, (0.013, 0.006), (0, 0.1095)),
-            Section(0.014, (0.013, 0.006), (0, 0.1095)),
-            Section(0.036, (0.009, 0.004), (0, 0.0985)),
+            Section(-0.036, (0.012, 0.006), (0, 0.0985)),
+            Section(-0.014, (0.017, 0.008), (0, 0.1095)),
+            Section(0.014, (0.017, 0.008), (0, 0.1095)),
+            Section(0.036, (0.012, 0.006), (0, 0.0985)),
         ],
-        segments=6,
+        segments=4,
+        caps="none",
     )
 
 
 def thigh() -> Surface:
-    """Returns the left thigh with the knee drum."""
+    """Returns the left thigh, which ends in the knee."""
     shell = loft(
         "z",
-        WHITE,
+        [GREY, WHITE, WHITE],
         [
-            Section(-0.094, (0.023, 0.022)),
-            Section(-0.074, (0.031, 0.028), (0.002, 0.002), 2.4),
-            Section(-0.030, (0.037, 0.032), (0.002, 0.004), 2.4),
-            Section(-0.002, (0.036, 0.031), (0, 0.004), 2.4),
+            Section(-0.116, (0.023, 0.026)),
+            Section(-0.080, (0.030, 0.029), (0.002, 0.002), 2.4),
+            Section(-0.016, (0.039, 0.034), (0.002, 0.004), 2.4),
             Section(0.022, (0.022, 0.021), (-0.004, 0.002)),
         ],
-        caps="high",
+        segments=6,
+        caps="none",
     )
-    shell = shell.painted(
-        ORANGE, lambda c: (c[1] > 0.021) & (c[2] > -0.06) & (c[2] < 0)
-    )
-    drum = loft(
-        "y",
-        GREY,
-        [Section(-0.026, (0.0235, 0.0235)), Section(0.029, (0.0235, 0.0235))],
-    ).painted(ORANGE, lambda c: c[1] > 0.028)
-    return join([shell, drum.shifted(0, 0, -0.1)])
+    return shell.painted(ORANGE, lambda c: (c[1] > 0.012) & (c[2] > -0.06) & (c[2] < 0))
 
 
 def shin() -> Surface:
     """Returns the left shin."""
     return loft(
         "z",
-        [GREY, WHITE, WHITE, WHITE],
+        [GREY, WHITE, WHITE],
         [
-            Section(-0.110, (0.023, 0.023)),
-            Section(-0.094, (0.033, 0.031), (0, 0.001), 2.3),
-            Section(-0.062, (0.038, 0.034), (-0.001, 0.002), 2.4),
-            Section(-0.028, (0.033, 0.030), (0.002, 0.002), 2.4),
+            Section(-0.110, (0.026, 0.026)),
+            Section(-0.092, (0.035, 0.033), (0, 0.001), 2.3),
+            Section(-0.046, (0.040, 0.036), (0, 0.002), 2.4),
             Section(-0.008, (0.022, 0.024), (0.005, 0.001)),
         ],
-        caps="high",
+        segments=6,
+        caps="none",
     )
 
 
@@ -234,21 +217,19 @@ def foot() -> Surface:
     """Returns the left foot, sole at z = -0.04511."""
     return loft(
         "z",
-        [DARK, WHITE, WHITE, GREY],
+        [DARK, WHITE],
         [
-            Section(-0.04511, (0.078, 0.033), (0.022, 0.002), 3.0),
-            Section(-0.038, (0.080, 0.035), (0.022, 0.002), 3.0),
-            Section(-0.022, (0.071, 0.033), (0.018, 0.002), 2.6),
-            Section(-0.008, (0.043, 0.029), (0.004, 0.001), 2.2),
-            Section(0.012, (0.024, 0.024)),
+            Section(-0.04511, (0.080, 0.035), (0.022, 0.002), 3.0),
+            Section(-0.036, (0.081, 0.036), (0.022, 0.002), 3.0),
+            Section(-0.002, (0.032, 0.027), (0.002, 0.001), 2.2),
         ],
-        segments=12,
+        segments=8,
         caps="none",
     )
 
 
-def shoulder() -> Surface:
-    """Returns the left shoulder: the drum between trunk and upper arm."""
+def drum() -> Surface:
+    """Returns the left shoulder's drum, round about the axis it turns on."""
     return loft(
         "y",
         [GREY, DARK],
@@ -257,75 +238,80 @@ def shoulder() -> Surface:
             Section(-0.024, (0.029, 0.029)),
             Section(-0.010, (0.022, 0.022)),
         ],
-        segments=12,
+        segments=8,
         caps="none",
     )
 
 
 def bicep() -> Surface:
-    """Returns the left upper arm with the shoulder cap."""
+    """Returns the left upper arm, from the shoulder's cap to the elbow's ball."""
     shell = loft(
         "x",
         WHITE,
         [
             Section(-0.0360, (0, 0)),
-            Section(-0.0290, (0.018, 0.019), (0.001, 0)),
-            Section(-0.0120, (0.030, 0.031), (0.002, 0)),
+            Section(-0.0270, (0.020, 0.021), (0.001, 0)),
+            Section(-0.0100, (0.031, 0.032), (0.002, 0)),
             Section(0.0200, (0.031, 0.032), (0.007, 0)),
             Section(0.0640, (0.0225, 0.0235), (0.015, 0)),
         ],
+        segments=8,
+        caps="high",
     )
-    return shell.painted(ORANGE, lambda c: (c[1] > 0.016) & (abs(c[0]) < 0.03))
+    shell = shell.painted(ORANGE, lambda c: (c[1] > 0.016) & (abs(c[0]) < 0.03))
+    return join([shell, elbow().shifted(0.105, 0.015, 0)])
 
 
 def elbow() -> Surface:
-    """Returns the left elbow: a sleeve and the drum of the elbow's roll."""
-    sleeve = loft(
-        "x",
-        SHELL,
-        [
-            Section(-0.043, (0.0190, 0.0190)),
-            Section(-0.010, (0.0205, 0.0205)),
-            Section(0.012, (0.013, 0.013)),
-        ],
-        caps="none",
-    )
-    rims = [Section(z, (0.0165, 0.0165)) for z in (-0.0225, 0.0225)]
-    return join([sleeve, loft("z", GREY, rims, segments=10)])
-
-
-def forearm() -> Surface:
-    """Returns the left forearm."""
+    """Returns the left elbow: a sleeve and a ball, round about the axis of the yaw."""
     return loft(
         "x",
-        [WHITE, WHITE, WHITE, ORANGE],
+        [SHELL, GREY, GREY],
         [
-            Section(0.005, (0.015, 0.015), (0.001, 0)),
-            Section(0.014, (0.024, 0.024), (0.002, 0)),
-            Section(0.032, (0.027, 0.027), (0.002, 0)),
-            Section(0.046, (0.0250, 0.0250), (0.001, 0)),
-            Section(0.053, (0.0240, 0.0240)),
+            Section(-0.043, (0.0190, 0.0190)),
+            Section(-0.010, (0.0215, 0.0215)),
+            Section(0.012, (0.0190, 0.0190)),
+            Section(0.022, (0, 0)),
         ],
-        lid=GREY,
+        segments=8,
+        caps="none",
     )
 
 
 def hand() -> Surface:
-    """Returns the left hand: wrist, palm and the seats of the fingers."""
+    """Returns the left hand: forearm, wrist, palm and the seats of the fingers."""
     palm = loft(
         "x",
-        [GREY, WHITE, WHITE, WHITE],
+        [GREY, WHITE, WHITE],
         [
-            Section(-0.004, (0.019, 0.019)),
-            Section(0.010, (0.021, 0.021)),
-            Section(0.028, (0.026, 0.025), (0, 0), 2.4),
-            Section(0.053, (0.026, 0.024), (0, -0.002), 2.5),
-            Section(0.067, (0.021, 0.011), (0, -0.001), 2.5),
+            Section(-0.004, (0.020, 0.020)),
+            Section(0.012, (0.022, 0.022)),
+            Section(0.042, (0.0275, 0.026), (0, -0.001), 2.5),
+            Section(0.067, (0.022, 0.011), (0, -0.001), 2.5),
         ],
+        segments=8,
         caps="high",
         lid=GREY,
     )
-    return palm.painted(GREY, lambda c: (c[2] < -0.008) & (c[0] > 0.012))
+    palm = palm.painted(GREY, lambda c: (c[2] < -0.008) & (c[0] > 0.012))
+    return join([forearm().shifted(-0.05595, 0, 0), palm])
+
+
+def forearm() -> Surface:
+    """Returns the left forearm, round about the axis of the wrist."""
+    return loft(
+        "x",
+        [WHITE, WHITE, ORANGE],
+        [
+            Section(0.004, (0.015, 0.015)),
+            Section(0.017, (0.0265, 0.0265)),
+            Section(0.045, (0.0260, 0.0260)),
+            Section(0.053, (0.0240, 0.0240)),
+        ],
+        segments=8,
+        caps="high",
+        lid=GREY,
+    )
 
 
 def phalanx() -> Surface:
@@ -335,11 +321,11 @@ def phalanx() -> Surface:
         SHELL,
         [
             Section(-0.0058, (0, 0)),
-            Section(-0.0005, (0.0059, 0.0059)),
-            Section(0.0130, (0.0059, 0.0059)),
+            Section(-0.0005, (0.0060, 0.0060)),
+            Section(0.0130, (0.0060, 0.0060)),
             Section(0.0188, (0, 0)),
         ],
-        segments=6,
+        segments=5,
         caps="none",
     )
 
@@ -350,12 +336,12 @@ def fingertip() -> Surface:
         "x",
         [SHELL, DARK, DARK],
         [
-            Section(-0.0025, (0.0052, 0.0052)),
-            Section(0.0080, (0.0060, 0.0060)),
+            Section(-0.0025, (0.0053, 0.0053)),
+            Section(0.0080, (0.0061, 0.0061)),
             Section(0.0142, (0.0046, 0.0046)),
             Section(0.0170, (0, 0)),
         ],
-        segments=6,
+        segments=5,
         caps="none",
     )
 

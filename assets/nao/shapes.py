@@ -10,6 +10,7 @@ Shapes: V vertices, F faces, R sections of a loft, P points of a section.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import trimesh
@@ -128,10 +129,10 @@ def loft(
         builder.add_span(span, color)
     if caps in ("low", "both") and any(sections[0].half):
         color = colors[0] if lid is None else lid
-        builder.add_lid(0, sections[0], color, up=False)
+        builder.add_lid(0, color, up=False)
     if caps in ("high", "both") and any(sections[-1].half):
         color = colors[-1] if lid is None else lid
-        builder.add_lid(spans, sections[-1], color, up=True)
+        builder.add_lid(spans, color, up=True)
     return builder.surface("xyz".index(axis))
 
 
@@ -254,15 +255,13 @@ class _Builder:
             self._add_face((low[i], high[j], high[i]), color)
             self._cell += 1
 
-    def add_lid(self, ring: int, section: Section, color: int, up: bool) -> None:
+    def add_lid(self, ring: int, color: int, up: bool) -> None:
         """Adds a flat lid that looks up or down the axis, with a hard edge."""
         self._group += 1
-        center = len(self._vertices)
-        self._vertices.append(np.array([section.at, *section.center]))
         points = self._rings[ring]
         points = points if up else points[::-1]
-        for a, b in zip(points, np.roll(points, -1), strict=True):
-            self._add_face((a, b, center), color)
+        for a, b in pairwise(points[1:]):
+            self._add_face((points[0], a, b), color)
         self._cell += 1
 
     def surface(self, axis: int) -> Surface:

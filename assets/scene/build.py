@@ -39,20 +39,26 @@ PALETTE = (
     (62, 78, 98),  # SKIRTING
 )
 _LIGHT = (0.6, 0.15, 1.0)
+_SIDES = ("+x", "+y", "+z", "-x", "-y", "-z")
 
 
-def box(*extents: tuple[float, float], color: int) -> Surface:
+def box(
+    *extents: tuple[float, float], color: int, sides: tuple[str, ...] = _SIDES
+) -> Surface:
     """Return a box along the axes, hard-edged.
 
     Args:
         *extents: (low, high) along x, y and z [m].
         color: Index into the palette.
+        sides: Those to draw, the ones that can be seen, such as "+x".
     """
     low, high = np.array(extents, float).T
     mesh = trimesh.creation.box(high - low)
     side = np.argmax(mesh.face_normals @ np.vstack([np.eye(3), -np.eye(3)]).T, axis=1)
+    seen = np.isin(side, [_SIDES.index(name) for name in sides])
+    faces, side = mesh.faces[seen], side[seen]
     vertices = mesh.vertices + (low + high) / 2
-    return Surface(vertices, mesh.faces, np.full(len(mesh.faces), color), side, side)
+    return Surface(vertices, faces, np.full(len(faces), color), side, side)
 
 
 def room() -> Surface:
@@ -62,15 +68,15 @@ def room() -> Surface:
     for x in (TABLE_X[0], TABLE_X[1] - LEG_WIDTH):
         for y in (TABLE_Y[0], TABLE_Y[1] - LEG_WIDTH):
             leg = ((x, x + LEG_WIDTH), (y, y + LEG_WIDTH), (SOLE_HEIGHT, TABLE_Z[0]))
-            parts.append(box(*leg, color=LEG))
+            parts.append(box(*leg, color=LEG, sides=("+x", "+y", "-x", "-y")))
     ground = (SOLE_HEIGHT - 0.02, SOLE_HEIGHT)
     behind = (ROOM_X[0] - 0.02, ROOM_X[0])
     before = (ROOM_X[0], ROOM_X[0] + 0.01)
     wall = (SOLE_HEIGHT, SOLE_HEIGHT + ROOM_HEIGHT)
     skirting = (SOLE_HEIGHT, SOLE_HEIGHT + SKIRTING_HEIGHT)
-    parts.append(box(ROOM_X, ROOM_Y, ground, color=FLOOR))
-    parts.append(box(behind, ROOM_Y, wall, color=WALL))
-    parts.append(box(before, ROOM_Y, skirting, color=SKIRTING))
+    parts.append(box(ROOM_X, ROOM_Y, ground, color=FLOOR, sides=("+z",)))
+    parts.append(box(behind, ROOM_Y, wall, color=WALL, sides=("+x",)))
+    parts.append(box(before, ROOM_Y, skirting, color=SKIRTING, sides=("+x", "+z")))
     return join(parts)
 
 
