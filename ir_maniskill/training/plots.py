@@ -1,11 +1,16 @@
-"""Learning curves: how a run got better, drawn from what it logged."""
+"""Learning curves: how runs got better, drawn from what they logged.
+
+Legend: R runs, P points.
+"""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -17,6 +22,8 @@ TRAINING = (
 """Columns of metrics.csv that are shares, and what the legend calls them."""
 COLORS = ("#2f6fde", "#22a06b", "#9aa3b2")
 """One for each of TRAINING."""
+CURVE_COLORS = ("#2f6fde", "#d9730d", "#22a06b", "#8250df", "#9aa3b2")
+"""Colors of compared curves, in turn."""
 INK = "#24292f"
 """Axes and text."""
 
@@ -56,6 +63,92 @@ def learning_curve(run: Path, out: Path | None = None) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
     return path
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Runs that differ by their seeds only."""
+
+    label: str
+    """What the legend calls them."""
+    runs: Sequence[Sequence[Mapping[str, float]]]
+    """Rows of the evaluations.csv of each run."""
+
+    def over_steps(self, column: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return all steps evaluated [P] and each run's values there [R, P].
+
+        Between its own evaluations a run is interpolated; before the first and after
+        the last it is NaN.
+        """
+        steps = np.unique([row["steps"] for run in self.runs for row in run])
+        values = [
+            np.interp(
+                steps,
+                [row["steps"] for row in run],
+                [row[column] for row in run],
+                left=np.nan,
+                right=np.nan,
+            )
+            for run in self.runs
+        ]
+        return steps, np.array(values)
+
+
+def compare(curves: Sequence[Curve], out: Path, level: float | None = None) -> Path:
+    """Draws ways of learning side by side: a line for the mean, a band for the range.
+
+    Args:
+        curves: At least one.
+        out: Picture to write.
+        level: Fingers a step to mark as the paper's; None: no such line.
+    """
+    figure = Figure(figsize=(8.0, 5.2), dpi=110, layout="constrained")
+    shares, fingers = figure.subplots(2, 1, sharex=True)
+    for index, curve in enumerate(curves):
+        color = CURVE_COLORS[index % len(CURVE_COLORS)]
+        _draw_range(shares, curve, "eval/exclusive", 100, color)
+        _draw_range(fingers, curve, "eval/right_fingers", 1, color)
+    if level is not None:
+        fingers.axhline(level, color=INK, linewidth=1.2, linestyle="--")
+        fingers.annotate(
+            f"the paper: {level:g}",
+            (1, level),
+            xycoords=fingers.get_yaxis_transform(),
+            xytext=(0, 3),
+            textcoords="offset points",
+            ha="right",
+            color=INK,
+            fontsize=8.5,
+        )
+    shares.set_ylim(-3, 103)
+    shares.set_ylabel("Exclusive success [%]")
+    fingers.set_ylim(bottom=0)
+    fingers.set_ylabel("Right fingers a step")
+    fingers.set_xlabel("Environment steps")
+    figure.legend(
+        *shares.get_legend_handles_labels(),
+        loc="outside upper left",
+        frameon=False,
+        fontsize=8.5,
+        labelcolor=INK,
+    )
+    for axes in (shares, fingers):
+        _polish(axes)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(out)
+    return out
+
+
+def _draw_range(
+    axes: Axes, curve: Curve, column: str, scale: float, color: str
+) -> None:
+    steps, values = curve.over_steps(column)
+    values = scale * values
+    seeds = f"{len(curve.runs)} seed{'s' if len(curve.runs) > 1 else ''}"
+    label = f"{curve.label} ({seeds})"
+    axes.plot(steps, np.nanmean(values, axis=0), "o-", color=color, ms=3, label=label)
+    low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
+    axes.fill_between(steps, low, high, color=color, alpha=0.18, linewidth=0)
 
 
 def _read(table: Path) -> list[dict[str, float]]:

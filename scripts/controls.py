@@ -1,0 +1,140 @@
+"""What a policy goes by: its figures when a sense or the sentence is taken from it.
+
+A policy that looks must fail with black pictures, and one that reads with a sentence
+that is not the one the episode is judged by. Every control plays the same scenes.
+
+    python scripts/controls.py
+    python scripts/controls.py runs/NaoTouchCubeShuffled-v1/best.safetensors
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ir_maniskill import experiment as catalog
+from ir_maniskill.environment.instructional_set import InstructionalSet
+from ir_maniskill.environment.vector import make_vec
+from ir_maniskill.experiment import Experiment
+from ir_maniskill.training.checkpoint import load_policy
+from ir_maniskill.training.evaluate import Policy, evaluate_policy, versions
+
+ROOT = Path(__file__).parent.parent
+OUT = ROOT / "docs" / "results" / "controls.json"
+SHIPPED = ROOT / "assets" / "policies"
+SEED = 2_000_000
+"""Seed of the first episode: those of `ir-maniskill evaluate`."""
+
+State = dict[str, Tensor]
+Change = Callable[[State], State]
+"""Takes something from the state s_t that the policy gets."""
+
+
+def without(*keys: str) -> Change:
+    """Return the control that replaces parts of the state by zeros.
+
+    Args:
+        *keys: Entries of the state; those it does not have are passed over.
+    """
+
+    def change(state: State) -> State:
+        blank = {key: torch.zeros_like(state[key]) for key in keys if key in state}
+        return {**state, **blank}
+
+    return change
+
+
+def retold(tokens: Tensor, instead: list[int]) -> Change:
+    """Return the control that swaps sentences.
+
+    Args:
+        tokens: All sentences of the task [I, L].
+        instead: For each sentence, the index of the one to give instead.
+    """
+
+    def change(state: State) -> State:
+        told = state["instruction"]  # [N, L]
+        index = (told[:, None] == tokens.to(told)).all(dim=2).int().argmax(dim=1)
+        other = tokens.to(told)[torch.tensor(instead)[index]]
+        return {**state, "instruction": other}
+
+    return change
+
+
+def controls(experiment: Experiment) -> dict[str, Change]:
+    """Return the controls by name; those of the sentence need several sentences."""
+    changes = {
+        "nothing taken away": without(),
+        "black pictures": without("images"),
+        "without touch": without("touch"),
+        "without joint positions and targets": without("proprioception", "target"),
+    }
+    count = len(experiment.sentences)
+    if count > 1:
+        tokens = InstructionalSet(experiment, torch.device("cpu")).tokens
+        shifted = [(index + 1) % count for index in range(count)]
+        changes["the sentence of another object"] = retold(tokens, shifted)
+        changes["always the first sentence"] = retold(tokens, [0] * count)
+    return changes
+
+
+def measure(path: Path, episodes: int, num_envs: int) -> tuple[str, dict[str, Any]]:
+    """Return a policy's task, and its figures under each control.
+
+    Args:
+        path: Policy or checkpoint file.
+        episodes: Episodes of each control, spread evenly over the sentences.
+        num_envs: Scenes simulated side by side.
+    """
+    agent, config, facts = load_policy(path)
+    changes = controls(catalog.get(config.env_id))
+    envs = make_vec(config.env_id, num_envs, **config.env_kwargs(training=False))
+    figures = {}
+    try:
+        for name, change in changes.items():
+            report = evaluate_policy(
+                _changed(agent.policy, change),
+                config.env_id,
+                episodes=episodes,
+                seed=SEED,
+                frames=config.frames,
+                envs=envs,
+                progress=True,
+            )
+            figures[name] = report.overall.as_dict()
+    finally:
+        envs.close()
+    about = {"steps": facts.get("steps"), "training_seed": config.seed, "seed": SEED}
+    return config.env_id, {**about, "versions": versions(), "controls": figures}
+
+
+def _changed(policy: Policy, change: Change) -> Policy:
+    return lambda state: policy(change(state))
+
+
+def main() -> None:
+    """Measure the policies given and write them into the file, beside others there."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser.add_argument(
+        "policies", nargs="*", type=Path, help="files; default: all that ship"
+    )
+    parser.add_argument("--episodes", type=int, default=60, help="of each control")
+    parser.add_argument("--num-envs", type=int, default=8)
+    parser.add_argument("--out", type=Path, default=OUT)
+    given = parser.parse_args()
+    data = json.loads(given.out.read_text()) if given.out.exists() else {}
+    for path in given.policies or sorted(SHIPPED.glob("*.safetensors")):
+        task, figures = measure(path, given.episodes, given.num_envs)
+        data[task] = figures
+        given.out.parent.mkdir(parents=True, exist_ok=True)
+        given.out.write_text(json.dumps(data, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
