@@ -26,6 +26,11 @@ from ir_maniskill.environment.bodies import positions
 from ir_maniskill.environment.instructional_set import InstructionalSet
 from ir_maniskill.environment.reward_generator import DenseWeights, FingerCount
 from ir_maniskill.environment.robot.nao import Nao
+from ir_maniskill.environment.robot.robot import (
+    Robot,
+    available_robots,
+    require_robot,
+)
 from ir_maniskill.experiment import Experiment
 
 TOUCH_FORCE = 0.01
@@ -52,15 +57,15 @@ class TouchEnv(BaseEnv):
       the touch is what is rewarded; the time limit does.
     """
 
-    SUPPORTED_ROBOTS = ("nao",)
+    SUPPORTED_ROBOTS: tuple[str | type[Robot], ...] = (Nao.uid,)
     SUPPORTED_REWARD_MODES = ("sparse", "dense", "normalized_dense", "none")
-    agent: Nao
+    agent: Robot
 
     def __init__(
         self,
         *args: Any,
         experiment: str | Experiment,
-        robot_uids: str = "nao",
+        robot_uids: str | type[Robot] = Nao.uid,
         render_backend: str | None = "auto",
         dense_weights: dict[str, float] | None = None,
         **kwargs: Any,
@@ -69,7 +74,8 @@ class TouchEnv(BaseEnv):
 
         Args:
             experiment: The experiment or its id.
-            robot_uids: Which robot; only "nao" is supported.
+            robot_uids: Which robot: a subclass of `Robot`, or the uid of a registered
+                one.
             render_backend: As for `BaseEnv`; "auto" is a CUDA device where there is
                 one and else whatever Vulkan finds, software included.
             dense_weights: Changes of `DenseWeights`, used by the dense reward modes.
@@ -78,11 +84,15 @@ class TouchEnv(BaseEnv):
 
         Raises:
             UnknownExperimentError: There is no experiment of that id.
+            RobotError: The robot cannot be used.
             RuntimeError: No Vulkan device can render here; says what to install.
         """
         if isinstance(experiment, str):
             experiment = catalog.get(experiment)
         self.experiment = experiment
+        require_robot(robot_uids)
+        # ManiSkill warns of robots that are not in here; ours are not the only ones.
+        self.SUPPORTED_ROBOTS = (*available_robots(), robot_uids)
         self.dense_weights = replace(DenseWeights(), **(dense_weights or {}))
         if render_backend == "auto":
             render_backend = "gpu" if torch.cuda.is_available() else "cpu"
