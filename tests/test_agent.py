@@ -8,7 +8,7 @@ from ir_maniskill.agent.actor import Actor
 from ir_maniskill.agent.alignment import FiLM
 from ir_maniskill.agent.critic import Standardize
 from ir_maniskill.agent.language_system import LanguageSystem
-from ir_maniskill.agent.perceptual_system import PaperVision, StridedVision, pixels
+from ir_maniskill.agent.perceptual_system import PaperVision, PatchVision, pixels
 from ir_maniskill.training.config import CONFIGS, AgentConfig
 
 TOKENS, ACTIONS = 5, 26
@@ -98,8 +98,8 @@ def test_vision_of_the_paper_resizes_what_has_another_size():
 
 
 @pytest.mark.parametrize("size", [(64, 32), (33, 17), (8, 8)])
-def test_strided_vision_takes_images_of_any_size(size):
-    vision = StridedVision(3, (2, *size), (16, 32, 32), 64, film_width=0)
+def test_patch_vision_takes_images_of_any_size(size):
+    vision = PatchVision(3, (2, *size), (16, 32, 32), 64, film_width=0)
     images = torch.zeros(2, 3, 2, *size, 3, dtype=torch.uint8)
     assert vision(images, torch.zeros(2, 0)).shape == (2, 64)
 
@@ -110,6 +110,15 @@ def test_film_at_first_changes_nothing_and_then_scales_and_shifts():
     with torch.no_grad():
         film.scale_and_shift.bias.copy_(torch.tensor([1.0, 0.5]))
     assert film(maps, torch.ones(1, 1)).unique().tolist() == [(1 + 1) * 3 + 0.5]
+
+
+def test_no_modulation_by_the_sentence_can_blind_the_agent():
+    vision = PatchVision(3, (2, 64, 32), (32, 32, 32), 64, film_width=10)
+    for film in (module for module in vision.modules() if isinstance(module, FiLM)):
+        film.scale_and_shift.bias.data.fill_(-30.0)
+    language, images = torch.randn(2, 10), make_state(n=2)["images"]
+    bright, dark = vision(images, language), vision(images // 4, language)
+    assert (bright - dark).abs().mean() > 0.05
 
 
 def test_film_lets_the_sentence_reach_the_convolutions():
@@ -146,7 +155,7 @@ def test_log_prob_of_an_action_is_that_of_the_gaussian():
 
 
 @pytest.mark.parametrize("critic", ["asymmetric", "separate", "shared"])
-@pytest.mark.parametrize("vision", ["strided", "paper"])
+@pytest.mark.parametrize("vision", ["patches", "paper"])
 def test_judging_an_action_agrees_with_having_acted(critic, vision):
     state = make_state()
     agent = make_agent(state, critic=critic, vision=vision, film=False)
@@ -199,7 +208,7 @@ def test_the_auxiliary_head_exists_only_if_its_loss_counts():
     action = torch.zeros(4, ACTIONS)
     with_head = make_agent(state, auxiliary_weight=0.1)
     assert with_head.evaluate_actions(state, action).target_position.shape == (4, 3)
-    without = make_agent(state)
+    without = make_agent(state, auxiliary_weight=0.0)
     assert without.evaluate_actions(state, action).target_position is None
 
 

@@ -11,7 +11,7 @@ from ir_maniskill.agent.actor import Actor, tanh_layers
 from ir_maniskill.agent.alignment import Alignment
 from ir_maniskill.agent.critic import Critic, Standardize
 from ir_maniskill.agent.language_system import LanguageSystem
-from ir_maniskill.agent.perceptual_system import BodySense, PaperVision, StridedVision
+from ir_maniskill.agent.perceptual_system import BodySense, PaperVision, PatchVision
 from ir_maniskill.training.config import AgentConfig
 
 State = dict[str, Tensor]
@@ -109,7 +109,8 @@ class StateEncoder(nn.Module):
         self.body = None
         if self.body_keys:
             inputs = sum(sizes[key] for key in self.body_keys)
-            self.body = BodySense(inputs, config.body_width)
+            patches = config.vision == "patches"
+            self.body = BodySense(inputs, config.body_width, normalize=patches)
             self.width += config.body_width
         self.alignment = Alignment()
 
@@ -145,7 +146,7 @@ class StateEncoder(nn.Module):
         if config.vision == "paper":
             return PaperVision(spec.frames, spec.cameras, config.vision_width)
         language = spec.tokens * config.language_width
-        return StridedVision(
+        return PatchVision(
             spec.frames,
             (spec.cameras, spec.height, spec.width),
             config.vision_channels,

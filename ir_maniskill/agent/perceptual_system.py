@@ -1,5 +1,6 @@
 """Perceptual System: images become V_t; proprioception and touch become H_t."""
 
+import itertools
 from collections.abc import Sequence
 
 import torch
@@ -46,35 +47,59 @@ class PaperVision(nn.Module):
 
 
 class CameraVision(nn.Module):
-    """Feature maps of one camera: stride-2 convolutions, modulated by the sentence."""
+    """Feature maps of one camera: patches, then convolutions, as the sentence asks.
+
+    The maps are normalized after the sentence has modulated them, with no shift of
+    their own: a ReLU passes something on then, whatever is learned. Without that,
+    training was seen to shift all maps below zero, and the agent was blind.
+    """
+
+    PATCH = 4
+    """Side of the patches that the first convolution reads [pixel]."""
 
     def __init__(self, frames: int, channels: Sequence[int], film_width: int) -> None:
         """Make one convolution for each of `channels`; no FiLM if `film_width` is 0."""
         super().__init__()
-        inputs = (3 * frames, *channels[:-1])
-        kernels = (5, *(3 for _ in inputs[1:]))
+        patches = nn.Conv2d(3 * frames, channels[0], self.PATCH, stride=self.PATCH)
+        pairs = itertools.pairwise(channels)
         self.convolutions = nn.ModuleList(
-            nn.Conv2d(into, out, kernel, stride=2, padding=kernel // 2)
-            for into, out, kernel in zip(inputs, channels, kernels, strict=True)
+            [patches]
+            + [
+                nn.Conv2d(into, out, 3, stride=1 if i else 2, padding=1)
+                for i, (into, out) in enumerate(pairs)
+            ]
         )
+        self.norms = nn.ModuleList(nn.GroupNorm(1, out, affine=False) for out in channels)
         self.films = nn.ModuleList(
             FiLM(film_width, out) if film_width and i else nn.Identity()
             for i, out in enumerate(channels)
         )
 
+    @classmethod
+    def cells(cls, height: int, width: int, convolutions: int) -> int:
+        """Return how many places the maps of an image [pixel] have in the end."""
+        sides = (height // cls.PATCH, width // cls.PATCH)
+        if convolutions > 1:
+            sides = ((sides[0] + 1) // 2, (sides[1] + 1) // 2)
+        return sides[0] * sides[1]
+
     def forward(self, images: Tensor, language: Tensor) -> Tensor:
         """Return the flat maps [N,D] of this camera's images [N,S,H,W,3]."""
         maps = pixels(torch.cat(images.unbind(1), dim=-1))  # [N,3S,H,W]
-        for convolve, film in zip(self.convolutions, self.films, strict=True):
+        layers = zip(self.convolutions, self.norms, self.films, strict=True)
+        for convolve, normalize, film in layers:
             maps = convolve(maps)
             if isinstance(film, FiLM):
                 maps = film(maps, language)
-            maps = functional.relu(maps, inplace=True)
+            maps = functional.relu(normalize(maps), inplace=True)
         return maps.flatten(1)
 
 
-class StridedVision(nn.Module):
-    """V_t for small images: few cheap convolutions for each camera, then one layer."""
+class PatchVision(nn.Module):
+    """V_t for small images: few cheap convolutions for each camera, then one layer.
+
+    V_t is brought to the scale of G_t, so that the actor hears both from the start.
+    """
 
     def __init__(
         self,
@@ -88,13 +113,14 @@ class StridedVision(nn.Module):
         """Make the nets for images of `size` (cameras, height, width)."""
         super().__init__()
         cameras, height, width = size
-        for _ in channels:
-            height, width = (height + 1) // 2, (width + 1) // 2
         self.cameras = nn.ModuleList(
             CameraVision(frames, channels, film_width) for _ in range(cameras)
         )
-        flat = cameras * channels[-1] * height * width
-        self.embedding = nn.Sequential(nn.Linear(flat, features), nn.ReLU())
+        cells = CameraVision.cells(height, width, len(channels))
+        flat = cameras * channels[-1] * cells
+        self.embedding = nn.Sequential(
+            nn.Linear(flat, features), nn.LayerNorm(features), nn.Tanh()
+        )
 
     def forward(self, images: Tensor, language: Tensor) -> Tensor:
         """Return V_t [N,D] of images [N,S,K,H,W,3], looked at as G_t [N,D'] asks."""
@@ -107,10 +133,17 @@ class StridedVision(nn.Module):
 class BodySense(nn.Module):
     """H_t: proprioception and touch together, through one linear layer."""
 
-    def __init__(self, inputs: int, features: int) -> None:
-        """Make the layer from `inputs` numbers to `features` units."""
+    def __init__(self, inputs: int, features: int, *, normalize: bool) -> None:
+        """Make the layer from `inputs` numbers to `features` units.
+
+        Args:
+            inputs: Numbers felt.
+            features: Units of H_t.
+            normalize: Whether to bring H_t to the scale of G_t.
+        """
         super().__init__()
-        self.embedding = nn.Sequential(nn.Linear(inputs, features), nn.Tanh())
+        norm = nn.LayerNorm(features) if normalize else nn.Identity()
+        self.embedding = nn.Sequential(nn.Linear(inputs, features), norm, nn.Tanh())
 
     def forward(self, *senses: Tensor) -> Tensor:
         """Return H_t [N,D] of senses [N,...], flattened side by side."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
 Sense = Literal["vision", "proprioception", "touch", "state"]
-Vision = Literal["strided", "paper"]
+Vision = Literal["patches", "paper"]
 CriticInput = Literal["asymmetric", "separate", "shared"]
 StdMode = Literal["annealed", "fixed", "learned"]
 
@@ -50,13 +50,13 @@ class AgentConfig:
     """Attention heads a layer."""
     language_width: int = 50
     """Units of each token's representation."""
-    vision: Vision = "strided"
-    """"paper": two 5x5 convolutions over the cameras side by side; "strided": three
-    stride-2 convolutions for each camera."""
-    vision_channels: tuple[int, ...] = (16, 32, 32)
-    """Channels of the strided convolutions; each halves height and width."""
+    vision: Vision = "patches"
+    """"paper": two 5x5 convolutions over the cameras side by side; "patches": a
+    convolution over 4x4 patches of each camera, then 3x3 ones, all normalized."""
+    vision_channels: tuple[int, ...] = (32, 32, 32)
+    """Channels of the convolutions of "patches"; the second halves the maps."""
     film: bool = True
-    """Whether the sentence modulates the strided convolutions (FiLM)."""
+    """Whether the sentence modulates the convolutions over patches (FiLM)."""
     vision_width: int = 256
     """Units of V_t."""
     body_width: int = 128
@@ -72,7 +72,7 @@ class AgentConfig:
     """Standard deviation of the action noise at the start."""
     std_final: float = 0.2
     """Standard deviation at the end, if annealed."""
-    auxiliary_weight: float = 0.0
+    auxiliary_weight: float = 3.0
     """Weight of the loss that predicts where the named object is; 0: no such head."""
 
     def __post_init__(self) -> None:
@@ -271,6 +271,7 @@ CONFIGS: dict[str, TrainConfig] = {
             critic="separate",
             std_mode="fixed",
             std=0.36,
+            auxiliary_weight=0.0,
         ),
         ppo=PPOConfig(
             rollouts=24,
