@@ -147,10 +147,9 @@ def _joint(given: Element, ours: Element, parent: str, place: np.ndarray) -> Ele
     SubElement(joint, "child", link=_get(ours, "child", "link"))
     _move(joint, place)
     SubElement(joint, "axis", xyz=_text(_axis(given)))
-    limit = given.find("limit")
-    usable = given.get("type") == "revolute" and limit is not None
-    wanted = ("lower", "upper", "effort", "velocity")
-    if not usable or any(key not in limit.attrib for key in wanted):
+    limit, wanted = given.find("limit"), {"lower", "upper", "effort", "velocity"}
+    turns = given.get("type") == "revolute"
+    if limit is None or not turns or not wanted <= limit.attrib.keys():
         limit = _part(ours, "limit")
     joint.append(limit)
     return joint
