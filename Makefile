@@ -19,7 +19,7 @@ export TORCH_INDEX
 # Threads that wait for work must not take the cores from the simulator.
 export OMP_WAIT_POLICY ?= passive
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-fast check format doctor wheel clean
+.PHONY: help setup demo test test-fast check format docs doctor wheel clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -37,7 +37,7 @@ $(VENV)/.stamp-torch: $(VENV)/.stamp-venv
 	touch $@
 
 $(PACKAGES): $(VENV)/.stamp-torch pyproject.toml constraints.txt
-	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[dev,docs]'
 	touch $@
 
 $(VULKAN): $(PACKAGES)
@@ -70,8 +70,11 @@ format: $(PACKAGES)  ## let ruff format and fix what it can
 wheel: $(VULKAN)  ## build the wheel, install it in a clean environment, step a task
 	scripts/check_wheel.sh $(VENV)
 
+docs: $(PACKAGES)  ## write the API reference to docs/api
+	$(BIN)/python scripts/api_docs.py
+
 doctor: $(PACKAGES)  ## say whether this machine can render, and what to install if not
 	@$(BIN)/python -I ir_maniskill/doctor.py
 
 clean:  ## remove what make made, except runs/
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	rm -rf $(VENV) build dist docs/api *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
