@@ -1,0 +1,327 @@
+import csv
+import dataclasses
+import multiprocessing as mp
+import os
+import socket
+import subprocess
+import sys
+import time
+from datetime import timedelta
+from pathlib import Path
+
+import pytest
+import torch
+from torch.nn.utils import parameters_to_vector
+from toy_envs import LENGTH, ToyVectorEnv, toy_config
+
+from ir_maniskill.agent import Agent, StateSpec
+from ir_maniskill.environment.state import StateStack
+from ir_maniskill.training import checkpoint, distributed, ppo
+from ir_maniskill.training import train as training
+from ir_maniskill.training.config import ConfigError
+from ir_maniskill.training.distributed import RankError
+from ir_maniskill.training.rollout import EpisodeSums, RewardScale, Rollout, collect
+from ir_maniskill.training.run_folder import RunFolder
+
+ENVS = 8  # of all ranks together
+UPDATE = 32 * LENGTH  # steps of an update of the toy task
+
+
+# -- Running ranks ---------------------------------------------------------------------
+
+
+def in_ranks(work, out, ranks=2):
+    """Let processes do work(out), and return their exit codes; None: still at it."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    context = mp.get_context("spawn")
+    ready = context.Barrier(ranks)
+    arguments = (ranks, port, ready, work, out)
+    processes = [
+        context.Process(target=as_rank, args=(rank, *arguments), daemon=True)
+        for rank in range(ranks)
+    ]
+    for process in processes:
+        process.start()
+    processes[0].join(900)
+    for process in processes[1:]:
+        process.join(30 if work is not keep_the_other_waiting else 0)
+    codes = [process.exitcode for process in processes]
+    for process in processes:
+        process.kill()
+    return codes
+
+
+def as_rank(rank, ranks, port, ready, work, out):
+    """Do the work in the environment that torchrun gives to a process."""
+    numbers = {"RANK": rank, "LOCAL_RANK": rank}
+    numbers |= {"WORLD_SIZE": ranks, "LOCAL_WORLD_SIZE": ranks, "MASTER_PORT": port}
+    os.environ.update({name: str(number) for name, number in numbers.items()})
+    os.environ["MASTER_ADDR"] = "127.0.0.1"
+    torch.set_num_threads(1)
+    training.FINAL_EPISODES = 16
+    ready.wait()  # loading may take one of them longer than the patience under test
+    work(out)
+
+
+def load(out, ranks=2):
+    return [torch.load(out / f"{rank}.pt") for rank in range(ranks)]
+
+
+# -- The joined batch ------------------------------------------------------------------
+
+
+def fixed_rollout():
+    """Return an agent with all its parts, and what it lived through in all envs."""
+    config = toy_config("x")
+    agent_config = dataclasses.replace(config.agent, auxiliary_weight=0.5)
+    envs, stack = ToyVectorEnv(ENVS), StateStack(3)
+    state = stack.reset(envs.reset(seed=0)[0])
+    torch.manual_seed(0)
+    agent = Agent(agent_config, StateSpec.of(state, 2))
+    rollout = Rollout(16, state, 2)
+    state, _ = collect(envs, stack, state, agent, rollout, config.ppo)
+    # What the ranks see shall differ, else per-rank statistics would do as well.
+    rollout.reward += 0.1 * torch.arange(ENVS)
+    rollout.state["privileged"] *= 1 + torch.arange(ENVS)[:, None]
+    rollout.finish(torch.zeros(ENVS), 0.9, 0.95)
+    return agent, rollout
+
+
+def share_of(rollout):
+    """Return this rank's part of the roll-out: its envs."""
+    count = ENVS // distributed.size()
+    mine = slice(distributed.rank() * count, (distributed.rank() + 1) * count)
+    rollout.num_envs = count
+    rollout.state = {key: kept[:, mine] for key, kept in rollout.state.items()}
+    for name, kept in vars(rollout).items():
+        if isinstance(kept, torch.Tensor):
+            setattr(rollout, name, kept[:, mine])
+    return rollout
+
+
+def learn_from_the_fixed_rollout(out):
+    with distributed.group(timedelta(minutes=2)):
+        agent, rollout = fixed_rollout()
+        rollout = share_of(rollout)
+        everything = torch.arange(16 * rollout.num_envs)
+        batch, config = rollout.batch(everything), toy_config("x").ppo
+        ppo.ppo_loss(agent, batch, config)[0].backward()
+        distributed.average_gradients(agent)
+        got = {"gradient": parameters_to_vector(w.grad for w in agent.parameters())}
+        got["norm"] = ppo.clip_gradient(agent, 0.01)
+        got["clipped"] = parameters_to_vector(w.grad for w in agent.parameters())
+        scale = RewardScale(rollout.num_envs, 0.9)
+        got["reward"] = scale(rollout.reward, rollout.done)
+        agent.observe(distributed.gather(rollout.state["privileged"].flatten(0, 1)))
+        got["buffers"] = torch.cat([b.flatten() for b in agent.buffers()])
+        # Without minibatches no shuffling tells the joined batch from the shares.
+        whole = dataclasses.replace(config, minibatch=None, epochs=20, max_kl=1e-4)
+        optimizer = torch.optim.SGD(agent.parameters(), 0.05)
+        got["figures"] = ppo.update(agent, optimizer, rollout, whole)
+        got["weights"] = parameters_to_vector(agent.parameters()).detach()
+        ppo.update(agent, optimizer, rollout, dataclasses.replace(config, minibatch=48))
+        got["minibatches"] = parameters_to_vector(agent.parameters()).detach()
+        number = distributed.rank() + 1
+        sums = EpisodeSums(steps=10 * number, episodes=number, reward=0.5, success=1)
+        got["sums"] = dataclasses.astuple(sums.over_ranks())
+        torch.save(got, out / f"{distributed.rank()}.pt")
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory):
+    """Return what each of two ranks has got, and what one has with the joined batch."""
+    two, one = tmp_path_factory.mktemp("two"), tmp_path_factory.mktemp("one")
+    assert in_ranks(learn_from_the_fixed_rollout, two) == [0, 0]
+    learn_from_the_fixed_rollout(one)
+    return *load(two), *load(one, 1)
+
+
+@pytest.mark.parametrize("what", ["gradient", "norm", "clipped", "buffers", "weights"])
+def test_two_ranks_get_what_one_gets_from_the_joined_batch(learned, what):
+    first, second, joined = (got[what] for got in learned)
+    assert torch.equal(first, second)
+    assert (first - joined).abs().max() <= 1e-6 * max(1, float(joined.abs().max()))
+    assert joined.abs().max() > 1e-3
+
+
+def test_rewards_are_scaled_by_the_returns_of_all_ranks(learned):
+    first, second, joined = (got["reward"] for got in learned)
+    assert torch.allclose(torch.cat([first, second], dim=1), joined, rtol=1e-6)
+
+
+def test_the_ranks_stop_their_epochs_together(learned):
+    first, second, joined = (got["figures"] for got in learned)
+    assert first == second
+    assert first == pytest.approx(joined, rel=1e-4, abs=1e-6)
+    assert 1 < first["epochs"] < 20
+
+
+def test_episodes_are_counted_over_all_ranks(learned):
+    first, second, _ = (EpisodeSums(*got["sums"]) for got in learned)
+    assert first == second == EpisodeSums(steps=30, episodes=3, reward=1.0, success=2)
+    assert first.means()["success"] == 2 / 3
+
+
+def test_minibatches_leave_the_ranks_with_the_same_weights(learned):
+    first, second, _ = (got["minibatches"] for got in learned)
+    assert torch.equal(first, second)
+    assert not torch.equal(first, learned[0]["weights"])
+
+
+# -- Training --------------------------------------------------------------------------
+
+
+def toy(out, **changes):
+    """Return the config of a run of four updates, and this rank's envs."""
+    return toy_config(out, **changes), ToyVectorEnv(ENVS // distributed.size())
+
+
+def interrupt(envs, error):
+    """Let the envs fail in the third update."""
+    step, calls = envs.step, []
+
+    def fail(action):
+        calls.append(None)
+        if len(calls) > 2 * UPDATE // ENVS + 1:
+            raise error
+        return step(action)
+
+    envs.step = fail
+    return envs
+
+
+def train_whole_and_in_halves(out):
+    with distributed.group(timedelta(minutes=2)):
+        config, envs = toy(out / "whole")
+        folder = distributed.from_first(lambda: RunFolder(out / "whole", resume=False))
+        trainer = training.Trainer(config, envs, folder)
+        got = {"scene": trainer.state["proprioception"]}
+        trainer.learn()
+        got |= {"action": trainer.rollout.action, "weights": trainer.agent.state_dict()}
+        torch.save(got, out / f"{distributed.rank()}.pt")
+        config, envs = toy(out / "halves")
+        with pytest.raises(KeyboardInterrupt):
+            training.train(config, envs=interrupt(envs, KeyboardInterrupt))
+        torch.manual_seed(123)  # whatever happens in between
+        training.train(config, resume=True, envs=toy(out / "halves")[1])
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    out = tmp_path_factory.mktemp("trained")
+    assert in_ranks(train_whole_and_in_halves, out) == [0, 0]
+    return out
+
+
+def test_ranks_end_with_the_same_weights_and_explore_apart(trained):
+    first, second = load(trained)
+    assert first["weights"].keys() == second["weights"].keys()
+    for name, weight in first["weights"].items():
+        assert torch.equal(weight, second["weights"][name]), name
+    assert not torch.isclose(first["action"], second["action"]).any()
+
+
+def test_the_ranks_have_the_scenes_of_one_with_all_envs(trained, tmp_path):
+    config, envs = toy(tmp_path)
+    folder = RunFolder(tmp_path, resume=False)
+    scene = training.Trainer(config, envs, folder).state["proprioception"]
+    assert torch.equal(torch.cat([got["scene"] for got in load(trained)]), scene)
+
+
+def test_a_run_of_two_ranks_resumes_bit_for_bit(trained):
+    whole, halves = (
+        checkpoint.read(trained / name / "last.safetensors").tensors
+        for name in ("whole", "halves")
+    )
+    same = [name for name in whole if not name.startswith("random.numpy")]
+    assert [name for name in same if not torch.equal(whole[name], halves[name])] == []
+    assert metrics(trained / "whole") == metrics(trained / "halves")
+
+
+def test_one_set_of_records_counts_all_ranks(trained):
+    steps = [int(row["steps"]) for row in metrics(trained / "whole")]
+    assert steps == [UPDATE * i for i in (1, 2, 3, 4)]
+    assert (trained / "whole" / "evaluation.json").exists()
+
+
+def metrics(folder):
+    with (folder / "metrics.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    return [{k: v for k, v in row.items() if "time" not in k} for row in rows]
+
+
+# -- Failures --------------------------------------------------------------------------
+
+
+def lose_the_other(out):
+    with distributed.group(timedelta(minutes=2)):
+        config, envs = toy(out)
+        if distributed.rank() == 1:
+            training.train(config, envs=interrupt(envs, RuntimeError("broken")))
+        with pytest.raises(RankError, match=r"rank 0 lost the others: one .* failed"):
+            training.train(config, envs=envs)
+
+
+def test_a_rank_that_fails_stops_the_others_with_their_work_saved(tmp_path):
+    assert in_ranks(lose_the_other, tmp_path) == [0, 1]
+    stored = checkpoint.read(tmp_path / "last.safetensors")
+    assert stored.metadata["steps"] == 2 * UPDATE
+
+
+def keep_the_other_waiting(out):
+    with distributed.group(timedelta(seconds=10)):
+        distributed.gather(torch.zeros(1))  # both are there
+        if distributed.rank() == 1:
+            time.sleep(300)
+        with pytest.raises(RankError, match="waiting for too long"):
+            distributed.gather(torch.zeros(1))
+
+
+def test_a_rank_that_hangs_does_not_keep_the_others_forever(tmp_path):
+    assert in_ranks(keep_the_other_waiting, tmp_path) == [0, None]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"num_envs": 8}, "num_envs: got 8, expected a multiple of 3"),
+        (
+            {"num_envs": 12, "ppo": {"rollouts": 12, "minibatch": 2}},
+            "minibatch: got 2, expected at least 3",
+        ),
+    ],
+)
+def test_what_ranks_cannot_share_is_refused(tmp_path, monkeypatch, changes, message):
+    monkeypatch.setattr(distributed, "size", lambda: 3)
+    config = toy_config(tmp_path)
+    learner = dataclasses.replace(config.ppo, **changes.pop("ppo", {}))
+    with pytest.raises(ConfigError, match=message):
+        training.train(dataclasses.replace(config, ppo=learner, **changes))
+
+
+def test_the_ranks_of_a_machine_share_its_cores(monkeypatch):
+    alone = distributed.cores()
+    assert alone == len(os.sched_getaffinity(0))
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", str(alone))
+    monkeypatch.setattr(distributed, "size", lambda: alone + 1)
+    assert distributed.cores() == 1
+
+
+# -- torchrun --------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_torchrun_trains_on_the_real_task(tmp_path):
+    command = Path(sys.executable).with_name("ir-maniskill")
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
+    torchrun += ["--nproc-per-node", "2", "--no-python", str(command)]
+    options = "--agent.senses state --agent.hidden 16 --agent.language-layers 1 "
+    options += "--num-envs 4 --ppo.rollouts 4 --ppo.minibatch 64 --ppo.epochs 1 "
+    options += "--total-steps 256 --eval-episodes 1 --out"
+    train = ["train", "NaoTouchCubeSingle-v1", *options.split(), str(tmp_path)]
+    done = subprocess.run([*torchrun, *train], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("The best policy is in") == 1
+    assert [row["steps"] for row in metrics(tmp_path)] == ["128", "256"]
