@@ -90,26 +90,28 @@ def test_options_are_dealt_out_one_each(envs: ProcessVectorEnv) -> None:
     assert obs["extra"]["target_object"].argmax(1).tolist() == wanted.tolist()
 
 
-def test_random_streams_can_be_restored(envs: ProcessVectorEnv) -> None:
-    envs.reset(seed=3)
-    drawn, _ = envs.reset()
-    streams = envs.get_rng_state()
-    envs.reset()
-    envs.set_rng_state(streams)
-    again, _ = envs.reset()
-    key = "object_position"
-    assert torch.equal(drawn["extra"][key], again["extra"][key])
-
-
 def test_wrong_shapes_are_refused(envs: ProcessVectorEnv) -> None:
     with pytest.raises(ValueError, match=r"got shape \(2, 26\), expected \(3, 26\)"):
         envs.step(torch.zeros(2, 26))
+    with pytest.raises(ValueError, match="actions: got NaN or infinity"):
+        envs.step(torch.full((3, 26), torch.nan))
     with pytest.raises(ValueError, match="seeds: got 2, expected 3"):
         envs.reset(seed=[1, 2])
     with pytest.raises(ValueError, match="num_envs: got 0"):
         make_vec(TASK, 0)
     with pytest.raises(catalog.UnknownExperimentError, match="available"):
         make_vec("NoSuchTask-v1", 1)
+
+
+def test_answers_of_different_commands_cannot_get_mixed(envs: ProcessVectorEnv) -> None:
+    envs.reset(seed=0)
+    with pytest.raises(WorkerError, match="step_async. comes first"):
+        envs.step_wait()
+    envs.step_async(torch.zeros(3, 26))
+    for command in (lambda: envs.step_async(torch.zeros(3, 26)), envs.reset):
+        with pytest.raises(WorkerError, match="last command has not been answered"):
+            command()
+    assert envs.step_wait()[4]["elapsed_steps"].tolist() == [1, 1, 1]
 
 
 def test_users_own_experiments_reach_the_workers() -> None:
@@ -137,16 +139,23 @@ def test_a_dead_worker_is_named_and_close_leaves_nothing() -> None:
         envs.step(torch.zeros(2, 26))
     envs.close()
     assert not any(alive(pid) for pid in victims)
+    with pytest.raises(WorkerError, match="closed"):
+        envs.reset()
 
 
 def test_a_hanging_worker_is_named_instead_of_waited_for() -> None:
-    envs = ProcessVectorEnv(catalog.get(TASK), 1, env_kwargs=KWARGS)
+    envs = make_vec(TASK, 1, sim_backend="physx_cpu", timeout=600, **KWARGS)
     envs.reset(seed=0)
+    assert envs._timeout == 600
     envs._timeout = 0.5
     os.kill(envs._processes[0].pid, signal.SIGSTOP)
     with pytest.raises(WorkerError, match="no answer within 0.5 s from .*worker-0"):
         envs.step(torch.zeros(1, 26))
     pid = envs._processes[0].pid
+    os.kill(pid, signal.SIGCONT)
+    with pytest.raises(WorkerError, match="not been answered"):  # not the late answer
+        envs.reset()
+    os.kill(pid, signal.SIGSTOP)
     envs.close()
     assert not alive(pid)
 

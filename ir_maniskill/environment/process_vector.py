@@ -158,13 +158,24 @@ class ProcessVectorEnv(VectorEnv):
         self._rows = [list(r) for r in np.array_split(np.arange(num_envs), workers)]
         self._pipes: list[Connection] = []
         self._processes: list[mp.process.BaseProcess] = []
+        self._busy = False
+        """Whether answers to a command are still to come."""
+        try:
+            self._start(env_kwargs or {})
+            self._connect()
+        except BaseException:
+            self.close()
+            raise
+
+    def _start(self, env_kwargs: dict[str, Any]) -> None:
+        """Start the workers, which make their envs and describe them."""
         context = mp.get_context("forkserver")
         context.set_forkserver_preload(["ir_maniskill"])
         for index, rows in enumerate(self._rows):
             ours, theirs = context.Pipe()
             process = context.Process(
                 target=_work,
-                args=(theirs, experiment, [int(r) for r in rows], env_kwargs or {}),
+                args=(theirs, self.experiment, [int(r) for r in rows], env_kwargs),
                 name=f"ir-maniskill-worker-{index}",
                 daemon=True,
             )
@@ -172,11 +183,6 @@ class ProcessVectorEnv(VectorEnv):
             theirs.close()
             self._pipes.append(ours)
             self._processes.append(process)
-        try:
-            self._connect()
-        except BaseException:
-            self.close_extras()
-            raise
 
     def _connect(self) -> None:
         """Learn the spaces from the workers and lay out the shared memory."""
@@ -233,11 +239,16 @@ class ProcessVectorEnv(VectorEnv):
         expected = self.action_space.shape
         if actions.shape != expected:
             raise ValueError(f"actions: got shape {actions.shape}, expected {expected}")
+        if not np.isfinite(actions).all():
+            raise ValueError("actions: got NaN or infinity, expected finite numbers")
+        self._require_idle()
         self._shared.arrays["action",][:] = actions
         self._send("step", [None] * len(self._pipes))
 
     def step_wait(self) -> Step:
         """Wait for all workers and return what `step` returns."""
+        if not self._busy:
+            raise WorkerError("there is nothing to wait for: `step_async` comes first")
         self._gather()
         shared = self._shared
         now = shared.read("now")
@@ -267,31 +278,26 @@ class ProcessVectorEnv(VectorEnv):
         if shared is not None:
             shared.close(unlink=True)
 
-    # -- Random streams --------------------------------------------------------------
-
-    def get_rng_state(self) -> list:
-        """Return each env's random stream as it was before the env's last reset.
-
-        `set_rng_state` followed by an unseeded `reset` starts the same episodes anew.
-        """
-        parts = self._command("get_rng", [None] * len(self._pipes))
-        return [state for part in parts for state in part]
-
-    def set_rng_state(self, states: list) -> None:
-        """Restore what `get_rng_state` returned."""
-        if len(states) != self.num_envs:
-            raise ValueError(
-                f"random streams: got {len(states)}, expected {self.num_envs}"
-            )
-        self._command("set_rng", [[states[r] for r in rows] for rows in self._rows])
-
     # -- Talking to the workers ------------------------------------------------------
 
     def _command(self, name: str, arguments: list) -> list:
+        self._require_idle()
         self._send(name, arguments)
         return self._gather()
 
+    def _require_idle(self) -> None:
+        """Raise unless the workers wait for a command: answers must not get mixed."""
+        if self.closed:
+            raise WorkerError("these envs are closed: make new ones")
+        if self._busy:
+            raise WorkerError(
+                "the last command has not been answered: `step_wait` must follow "
+                "`step_async`; after an interrupt or an error close these envs and "
+                "make new ones"
+            )
+
     def _send(self, name: str, arguments: list) -> None:
+        self._busy = True
         for index, (pipe, argument) in enumerate(
             zip(self._pipes, arguments, strict=True)
         ):
@@ -321,6 +327,7 @@ class ProcessVectorEnv(VectorEnv):
                     raise WorkerError(
                         f"{self._describe(index)} failed:\n{answers[index]}"
                     )
+        self._busy = False
         return answers
 
     def _describe(self, index: int) -> str:
@@ -361,7 +368,6 @@ class _Worker:
         # ManiSkill collects garbage whenever it rebuilds a scene, which seeded resets
         # do; what is alive now stays alive, so there is no point in looking at it.
         gc.freeze()
-        self._rng: list = [None] * len(rows)
 
     def describe(self) -> tuple[Tree, gym.Space, gym.Space]:
         """Return a one-row sample of all that is shared, and the spaces."""
@@ -386,14 +392,8 @@ class _Worker:
             self._reset(index, seed, options)
 
     def _reset(self, index: int, seed: int | None, options: dict | None) -> None:
-        env = self._envs[index]
-        if seed is not None:
-            self._rng[index] = np.random.RandomState(seed).get_state(legacy=False)
-        else:
-            self._rng[index] = _stream(env).get_state(legacy=False)
-        self._shared.write(
-            self._rows[index], _record(*env.reset(seed=seed, options=options))
-        )
+        obs, info = self._envs[index].reset(seed=seed, options=options)
+        self._shared.write(self._rows[index], _record(obs, info))
 
     def step(self, _: None) -> None:
         """Step every env, and reset it if its episode is over."""
@@ -409,23 +409,10 @@ class _Worker:
             else:
                 self._shared.write(row, record)
 
-    def get_rng(self, _: None) -> list:
-        """Return the random streams as they were before the last resets."""
-        return self._rng
-
-    def set_rng(self, states: list) -> None:
-        """Set the random streams."""
-        for env, state in zip(self._envs, states, strict=True):
-            _stream(env).set_state(state)
-
 
 def _record(obs: Tree, info: Tree) -> Tree:
     """Return what is shared of an observation and info: the cameras do not move."""
     return {"obs": {k: v for k, v in obs.items() if k != "sensor_param"}, "info": info}
-
-
-def _stream(env: Any) -> np.random.RandomState:
-    return env.unwrapped._batched_episode_rng.rngs[0]
 
 
 def _work(

@@ -12,7 +12,6 @@ from typing import Any
 import gymnasium as gym
 import torch
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
-from numpy.random import RandomState
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.process_vector import ProcessVectorEnv
@@ -23,6 +22,7 @@ def make_vec(
     num_envs: int,
     *,
     num_workers: int | None = None,
+    timeout: float = 180.0,
     sim_backend: str = "auto",
     **env_kwargs: Any,
 ) -> GpuVectorEnv | ProcessVectorEnv:
@@ -32,6 +32,7 @@ def make_vec(
         task_id: A registered task id.
         num_envs: Number of envs N.
         num_workers: Worker processes on the CPU; None is one per core.
+        timeout: How long a worker process may take for one command [s].
         sim_backend: "physx_cuda" (one process, batched), "physx_cpu" (processes), or
             "auto": CUDA where torch sees a device, else processes.
         **env_kwargs: As for `gym.make(task_id)`.
@@ -49,7 +50,11 @@ def make_vec(
     if sim_backend.startswith("physx_cuda"):
         return GpuVectorEnv(task_id, num_envs, sim_backend=sim_backend, **env_kwargs)
     return ProcessVectorEnv(
-        experiment, num_envs, num_workers=num_workers, env_kwargs=env_kwargs
+        experiment,
+        num_envs,
+        num_workers=num_workers,
+        env_kwargs=env_kwargs,
+        timeout=timeout,
     )
 
 
@@ -64,7 +69,6 @@ class GpuVectorEnv(ManiSkillVectorEnv):
         env = gym.make(task_id, num_envs=num_envs, **env_kwargs)
         super().__init__(env, ignore_terminations=True)
         self.experiment = self.base_env.experiment
-        self._rng: list = [None] * num_envs
 
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict | None = None
@@ -72,22 +76,4 @@ class GpuVectorEnv(ManiSkillVectorEnv):
         """Reset all envs, or those of `options["env_idx"]`."""
         if isinstance(seed, int):
             seed = list(range(seed, seed + self.num_envs))
-        rows = range(self.num_envs)
-        if options and "env_idx" in options:
-            rows = options["env_idx"].tolist()
-        for index, row in enumerate(rows):
-            stream = self._stream(row) if seed is None else RandomState(seed[index])
-            self._rng[row] = stream.get_state(legacy=False)
         return super().reset(seed=seed, options=options)
-
-    def get_rng_state(self) -> list:
-        """Return each env's random stream as it was before the env's last reset."""
-        return list(self._rng)
-
-    def set_rng_state(self, states: list) -> None:
-        """Restore what `get_rng_state` returned; an unseeded `reset` must follow."""
-        for row, state in enumerate(states):
-            self._stream(row).set_state(state)
-
-    def _stream(self, row: int) -> RandomState:
-        return self.base_env._batched_episode_rng.rngs[row]
