@@ -205,7 +205,9 @@ def limit_table(oracle: Mapping[str, Figures], policies: Mapping[str, Figures]) 
     for task, figures in oracle.items():
         scores = policies.get(task, {}).get("instructions", {})
         for sentence, goals in figures["instructions"].items():
-            many, soon = goals["fingers"], goals["touching"]
+            # Either goal's plans are plans for the other, too.
+            many = max(goals.values(), key=lambda goal: goal["right_fingers"])
+            soon = max(goals.values(), key=lambda goal: goal["touching"])
             score = scores.get(sentence)
             rows.append(
                 (

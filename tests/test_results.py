@@ -119,6 +119,9 @@ def test_the_policy_is_compared_with_the_limit_of_its_sentence():
     cells = results.limit_table(oracle, shipped).splitlines()[2].split(" | ")
     assert cells[5:] == ["4.00", "3.00", "0.75", "100.0%", "80.0%", "0.80 |"]
     assert "0.75" not in results.limit_table(oracle, {})
+    del goals["touching"]
+    cells = results.limit_table(oracle, shipped).splitlines()[2].split(" | ")
+    assert cells[8:] == ["80.0%", "80.0%", "1.00 |"]
 
 
 def test_only_what_stands_between_markers_is_written():
