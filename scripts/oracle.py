@@ -147,9 +147,9 @@ class Effort:
 FROM_NOTHING = Effort(rounds=30, size=96, spread=0.4)
 """For the first scene of a sentence, if no known plan touches its object alone."""
 ADAPT = Effort(rounds=12, size=32, spread=0.12, patience=5)
-"""For the first scene of a sentence, if one does."""
+"""For the first scene if one does, and for others where none does."""
 REFINE = Effort(rounds=4, size=16, spread=0.05, patience=2)
-"""For the other scenes, from the plans for those before."""
+"""For other scenes, from the plans for those before."""
 EFFORTS = (FROM_NOTHING, ADAPT, REFINE)
 
 
@@ -223,21 +223,19 @@ def explore(
         seeds: Of the scenes.
         goal: What is good.
         known: Plans to begin with, beside staying at the start.
-        efforts: To search from nothing, to adapt a plan, to refine one.
+        efforts: As `EFFORTS`.
     """
-    from_nothing, adapt, effort = efforts
     rng = np.random.default_rng(seeds[0])
     still = stage.start(seeds[0], instruction, rebuild=True)
     known = [np.append([still, still], 0.0), *known]
     found: list[Found] = []
     for seed in tqdm(seeds, f"instruction {instruction}, {goal}"):
         play = partial(stage.play, seed=seed, instruction=instruction)
-        if not found:
-            touched = any(play(plan).exclusive for plan in known)
-            effort = adapt if touched else from_nothing
+        touched = any(play(plan).exclusive for plan in known)
+        effort = efforts[touched + bool(found)]
         plan = search(play, known, goal, effort, rng)
         found.append(Found(seed, plan, play(plan, rebuild=True)))
-        known, effort = [one.plan for one in found[-4:]], efforts[-1]
+        known = [one.plan for one in found[-4:]]
     return found
 
 

@@ -125,6 +125,25 @@ def test_later_scenes_begin_with_what_was_found_before(stage):
     assert figures["episodes"] == 2
 
 
+@pytest.mark.parametrize("touched, tries", [(False, [30, 20]), (True, [20, 10])])
+def test_where_no_known_plan_touches_the_search_is_wider(touched, tries):
+    count = {SEED: 0, SEED + 3: 0}
+
+    class Scene:
+        def start(self, seed, instruction, rebuild):
+            return np.zeros(len(JOINTS))
+
+        def play(self, plan, seed, instruction, rebuild=False):
+            count[seed] += 1
+            return outcome([0, int(touched), 0, 0])
+
+    efforts = tuple(Effort(rounds=1, size=size, spread=0.1) for size in (30, 20, 10))
+    oracle.explore(Scene(), 0, list(count), "fingers", [], efforts)
+    # Beside the search's own tries: each known plan twice at most, and the end result.
+    extra = [n - wanted for n, wanted in zip(count.values(), tries, strict=True)]
+    assert all(2 <= n <= 3 for n in extra)
+
+
 def test_a_recorded_plan_still_does_what_it_did(stage):
     """If this fails, the scenes have changed: run scripts/oracle.py again."""
     record = recorded_plan()
