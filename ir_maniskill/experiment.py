@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Literal
+from numbers import Integral, Real
+from typing import Any, Literal
 
 VOCABULARY = (
     "<pad>",
@@ -86,6 +88,7 @@ class TouchObject:
         """
         _check_choice("object color", self.color, COLORS)
         _check_choice("object shape", self.shape, SHAPES)
+        _check_tuple(f"position of the {self.name}", self.position, Real)
         if len(self.position) != 2 or not all(map(math.isfinite, self.position)):
             raise ExperimentError(
                 f"position of the {self.name}: got {self.position!r}, "
@@ -129,11 +132,7 @@ class Jitter:
             ExperimentError: A half-width is negative or too large to be safe.
         """
         for name, largest in (("position", 0.05), ("yaw", math.pi), ("joints", 0.3)):
-            value = getattr(self, name)
-            if not 0 <= value <= largest:
-                raise ExperimentError(
-                    f"jitter.{name}: got {value!r}, expected 0 to {largest}"
-                )
+            _check_number(f"jitter.{name}", getattr(self, name), 0, largest)
 
 
 RewardKind = Literal["binary", "per_finger"]
@@ -173,21 +172,16 @@ class Experiment:
         """
         _check_id(self.id)
         _check_choice("reward", self.reward, ("binary", "per_finger"))
-        if not 0 <= self.wrong_penalty <= 10:
-            raise ExperimentError(
-                f"wrong_penalty: got {self.wrong_penalty!r}, expected 0 to 10"
-            )
-        if not 1 <= self.episode_steps <= 10_000:
-            raise ExperimentError(
-                f"episode_steps: got {self.episode_steps!r}, expected 1 to 10000"
-            )
+        _check_number("wrong_penalty", self.wrong_penalty, 0, 10)
+        _check_number("episode_steps", self.episode_steps, 1, 10_000, Integral)
+        _check_type("jitter", self.jitter, Jitter)
+        _check_type("shuffled", self.shuffled, bool)
+        _check_tuple("senses", self.senses, str)
         for sense in self.senses:
             _check_choice("sense", sense, SENSES)
-        if self.vocabulary[:2] != VOCABULARY[:2]:
-            raise ExperimentError(
-                f"vocabulary: got {self.vocabulary[:2]!r} as its first two tokens, "
-                f"expected {VOCABULARY[:2]!r}"
-            )
+        _check_tuple("objects", self.objects, TouchObject)
+        _check_tuple("instructions", self.instructions, Instruction)
+        self._check_vocabulary()
         self._check_instructions()
         self._check_layout()
 
@@ -202,6 +196,25 @@ class Experiment:
         names = [thing.name for thing in self.objects]
         return tuple(names.index(i.target) for i in self.instructions)
 
+    def _check_vocabulary(self) -> None:
+        _check_tuple("vocabulary", self.vocabulary, str)
+        if self.vocabulary[:2] != VOCABULARY[:2]:
+            raise ExperimentError(
+                f"vocabulary: got {self.vocabulary[:2]!r} as its first two tokens, "
+                f"expected {VOCABULARY[:2]!r}"
+            )
+        for index, word in enumerate(self.vocabulary[2:], start=2):
+            if self._tokens(word) != (index,):
+                raise ExperimentError(
+                    f"vocabulary: got {word!r}, expected words in lower case and "
+                    "full stops, no two alike"
+                )
+
+    def _tokens(self, sentence: str) -> tuple[int, ...]:
+        from ir_maniskill.environment.instructional_set import tokenize  # imports this
+
+        return tuple(tokenize(sentence, self.vocabulary))
+
     def _check_instructions(self) -> None:
         names = [thing.name for thing in self.objects]
         if len(set(names)) != len(names) or not names:
@@ -210,10 +223,22 @@ class Experiment:
             )
         if not self.instructions:
             raise ExperimentError("instructions: got none, expected at least one")
+        said: dict[tuple[int, ...], Instruction] = {}
         for instruction in self.instructions:
             _check_choice("instruction target", instruction.target, names)
-            if not instruction.text.strip():
-                raise ExperimentError("instruction text: got an empty sentence")
+            _check_type("instruction text", instruction.text, str)
+            tokens = self._tokens(instruction.text)
+            if not tokens:
+                raise ExperimentError(
+                    f"instruction text: got {instruction.text!r}, an empty sentence"
+                )
+            other = said.setdefault(tokens, instruction)
+            if other.target != instruction.target:
+                raise ExperimentError(
+                    f"instructions: got {other.text!r} and {instruction.text!r}, which "
+                    f"are the same to the vocabulary {self.vocabulary}; expected it to "
+                    "have the words that tell their objects apart"
+                )
 
     def _check_layout(self) -> None:
         slack = self.jitter.position * math.sqrt(2)
@@ -284,14 +309,33 @@ def available() -> tuple[str, ...]:
     return tuple(_CATALOG)
 
 
-def _check_choice(what: str, got: str, choices: Iterable[str]) -> None:
+def _check_choice(what: str, got: Any, choices: Iterable[str]) -> None:
     if got not in (available := tuple(choices)):
         raise ExperimentError(f"{what}: got {got!r}, available: {', '.join(available)}")
 
 
-def _check_id(experiment_id: str) -> None:
-    name, _, version = experiment_id.rpartition("-v")
-    if not name.replace("-", "").replace("_", "").isalnum() or not version.isdigit():
+def _check_number(
+    what: str, got: Any, low: float, high: float, kind: type = Real
+) -> None:
+    if not (isinstance(got, kind) and low <= got <= high):  # type: ignore[operator]
+        raise ExperimentError(f"{what}: got {got!r}, expected {low} to {high}")
+
+
+def _check_type(what: str, got: Any, kind: type) -> None:
+    if not isinstance(got, kind):
+        raise ExperimentError(f"{what}: got {got!r}, expected a {kind.__name__}")
+
+
+def _check_tuple(what: str, got: Any, kind: type) -> None:
+    if not (isinstance(got, tuple) and all(isinstance(item, kind) for item in got)):
+        raise ExperimentError(f"{what}: got {got!r}, expected ({kind.__name__}, ...)")
+
+
+def _check_id(experiment_id: Any) -> None:
+    form = r"\w[\w-]*-v\d+"
+    if not (
+        isinstance(experiment_id, str) and re.fullmatch(form, experiment_id, re.ASCII)
+    ):
         raise ExperimentError(
             f'experiment id: got {experiment_id!r}, expected a form like "MyTask-v1"'
         )

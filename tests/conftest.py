@@ -6,9 +6,13 @@ from typing import Any
 import gymnasium as gym
 import pytest
 import torch
+from hypothesis import settings
 
 import ir_maniskill
 from ir_maniskill.environment.process_vector import ProcessVectorEnv
+
+settings.register_profile("busy machines", deadline=None)
+settings.load_profile("busy machines")
 
 SMALL = {"width": 32, "height": 64, "shader_pack": "trivial"}
 """Cameras of the tests: small, and with the shaders that compile fastest."""

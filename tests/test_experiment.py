@@ -2,16 +2,21 @@
 
 import dataclasses
 import json
+import math
+import pickle
 
 import gymnasium as gym
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 import ir_maniskill
 from ir_maniskill import experiment as catalog
+from ir_maniskill.environment.instructional_set import InstructionalSet
 from ir_maniskill.experiment import (
     COLORS,
+    VOCABULARY,
     Experiment,
     ExperimentError,
     Instruction,
@@ -91,6 +96,16 @@ def test_an_id_cannot_be_taken_twice() -> None:
         ({"objects": ()}, "at least one"),
         ({"objects": (BLUE, BLUE)}, "no two alike"),
         ({"vocabulary": ("touch", "the")}, "vocabulary: got"),
+        ({"vocabulary": (*VOCABULARY, "Car")}, "got 'Car', expected words in lower"),
+        ({"vocabulary": (*VOCABULARY, "cube")}, "got 'cube', .* no two alike"),
+        ({"vocabulary": "touch"}, r"vocabulary: got 'touch', expected \(str, ...\)"),
+        ({"objects": [BLUE]}, r"expected \(TouchObject, ...\)"),
+        ({"instructions": (Instruction("?!", "red cube"),)}, "'\\?!', an empty"),
+        ({"instructions": (Instruction(3, "red cube"),)}, "got 3, expected a str"),
+        ({"shuffled": "no"}, "shuffled: got 'no', expected a bool"),
+        ({"jitter": 0.01}, "jitter: got 0.01, expected a Jitter"),
+        ({"wrong_penalty": "1"}, "wrong_penalty: got '1', expected 0 to 10"),
+        ({"episode_steps": 32.0}, "episode_steps: got 32.0"),
     ],
 )
 def test_malformed_experiments_are_refused(changes: dict, message: str) -> None:
@@ -147,3 +162,56 @@ def test_whatever_is_accepted_can_be_reached_and_does_not_overlap(
         for b in made.objects[:i]:
             dx, dy = x - b.position[0], y - b.position[1]
             assert (dx**2 + dy**2) ** 0.5 > 0.04
+
+
+def test_sentences_that_the_learner_cannot_tell_apart_are_refused() -> None:
+    things = (TouchObject("purple", (0.2, 0.0)), TouchObject("orange", (0.2, 0.1)))
+    with pytest.raises(ExperimentError, match="the words that tell their objects"):
+        Experiment("Fruit-v1", things, touch_instructions(things))
+    Experiment(
+        "Fruit-v1",
+        things,
+        touch_instructions(things),
+        vocabulary=(*VOCABULARY, "purple"),
+    )
+
+
+ANYTHING = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.binary(),
+    lambda inner: st.lists(inner).map(tuple) | st.dictionaries(st.text(), inner),
+    max_leaves=4,
+)
+
+
+@pytest.mark.parametrize("sound", [make(), BLUE, Jitter()], ids=lambda x: type(x))
+@given(data=st.data())
+def test_whatever_a_field_is_set_to_it_works_or_is_refused(
+    sound: Experiment | TouchObject | Jitter, data: st.DataObject
+) -> None:
+    field = data.draw(st.sampled_from([f.name for f in dataclasses.fields(sound)]))
+    value = data.draw(ANYTHING | st.sampled_from(("binary", 0.01, (0.2, -0.1), 40)))
+    try:
+        made = dataclasses.replace(sound, **{field: value})
+    except ExperimentError as error:
+        assert repr(value) in str(error) or "got" in str(error)
+        return
+    assert pickle.loads(pickle.dumps(made)) == made  # workers get it like this
+    if isinstance(made, Experiment):
+        assert made.episode_steps >= 1
+        assert math.isfinite(made.wrong_penalty)
+        InstructionalSet(made, torch.device("cpu"))
+
+
+@given(st.lists(st.tuples(st.text(), st.booleans()), min_size=1, max_size=4))
+def test_accepted_sentences_have_tokens_that_say_which_object(
+    said: list[tuple[str, bool]],
+) -> None:
+    orders = tuple(Instruction(t, (BLUE if b else RED).name) for t, b in said)
+    try:
+        made = InstructionalSet(make(instructions=orders), torch.device("cpu"))
+    except ExperimentError:
+        return
+    assert (made.tokens[:, 0] > 0).all()
+    meanings = dict(zip(map(tuple, made.tokens.tolist()), made.targets, strict=True))
+    for row, target in zip(made.tokens.tolist(), made.targets, strict=True):
+        assert meanings[tuple(row)] == target

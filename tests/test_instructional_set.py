@@ -58,3 +58,21 @@ def test_uniform_numbers_pick_every_instruction_equally() -> None:
     instructions = InstructionalSet(catalog.get("NaoTouchCubeMulti-v1"), CPU)
     picks = instructions.pick(torch.tensor([0.0, 0.33, 0.34, 0.66, 0.67, 1.0]))
     assert picks.tolist() == [0, 0, 1, 1, 2, 2]
+
+
+@given(st.text(), st.text())
+def test_sentences_are_read_word_by_word(first: str, second: str) -> None:
+    assert tokenize(f"{first} {second}") == tokenize(first) + tokenize(second)
+
+
+@given(st.text(st.characters(max_codepoint=127)))
+def test_case_never_matters(text: str) -> None:
+    assert tokenize(text.upper()) == tokenize(text.lower()) == tokenize(text)
+
+
+@given(st.lists(st.floats(0, 1, width=32), min_size=1))
+def test_any_uniform_number_picks_an_instruction(numbers: list[float]) -> None:
+    instructions = InstructionalSet(catalog.get("NaoTouchCubeMulti-v1"), CPU)
+    ordered = instructions.pick(torch.tensor(sorted(numbers)))
+    assert ((ordered >= 0) & (ordered < len(instructions))).all()
+    assert (ordered.diff() >= 0).all()

@@ -1,6 +1,8 @@
 """The paper's rewards, by hand, without a simulator."""
 
 import dataclasses
+import math
+from random import Random
 
 import pytest
 import torch
@@ -97,3 +99,95 @@ def test_a_penalty_in_the_line_is_a_field_of_the_experiment() -> None:
     stern = dataclasses.replace(LINE, id="Stern-v1", wrong_penalty=0.5)
     count = FingerCount(torch.tensor([4]), torch.tensor([2]))
     assert sparse_reward(stern, count).item() == pytest.approx(0.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """What a step of N envs may look like."""
+
+    contact: torch.Tensor  # [N, F, C]
+    target: torch.Tensor  # [N]
+    distance: torch.Tensor  # [N, F] [m]
+    wrong_once: torch.Tensor  # [N]
+
+    def reward(self, experiment: catalog.Experiment, **changes: object) -> torch.Tensor:
+        """Return the dense reward, with some of this changed."""
+        scene = dataclasses.replace(self, **changes)
+        count = count_fingers(scene.contact, scene.target)
+        rest = (scene.distance, scene.wrong_once, DenseWeights())
+        return dense_reward(experiment, count, *rest)
+
+
+@st.composite
+def scenes(draw: st.DrawFn) -> Scene:
+    """Draw a scene of up to 5 envs with 6 fingers and up to 4 objects."""
+    n, c = draw(st.integers(1, 5)), draw(st.integers(1, 4))
+    generator = torch.Generator().manual_seed(draw(st.integers(0, 2**31)))
+    crowd = draw(st.floats(0, 1))
+    return Scene(
+        torch.rand(n, 6, c, generator=generator) < crowd,
+        torch.randint(c, (n,), generator=generator),
+        torch.rand(n, 6, generator=generator),
+        torch.rand(n, generator=generator) < 0.5,
+    )
+
+
+experiments = st.builds(
+    lambda kind, penalty: dataclasses.replace(LINE, reward=kind, wrong_penalty=penalty),
+    st.sampled_from(("binary", "per_finger")),
+    st.floats(0, 10),
+)
+
+
+@given(scenes(), experiments)
+def test_rewards_stay_within_their_bounds(
+    scene: Scene, experiment: catalog.Experiment
+) -> None:
+    dense, most = (
+        scene.reward(experiment),
+        highest_reward(experiment, 6, DenseWeights()),
+    )
+    assert dense.isfinite().all()
+    assert (dense <= most + 1e-6).all()
+    assert (dense >= -6 * experiment.wrong_penalty - DenseWeights().wrong - 1e-5).all()
+
+
+@given(scenes(), experiments, st.randoms())
+def test_rewards_do_not_depend_on_how_envs_fingers_and_objects_are_numbered(
+    scene: Scene, experiment: catalog.Experiment, random: Random
+) -> None:
+    n, f, c = scene.contact.shape
+    rows, fingers, things = (random.sample(range(k), k) for k in (n, f, c))
+    places = torch.tensor(things).argsort()  # where each object went
+    shuffled = Scene(
+        scene.contact[rows][:, fingers][:, :, things],
+        places[scene.target[rows]],
+        scene.distance[rows][:, fingers],
+        scene.wrong_once[rows],
+    )
+    expected = scene.reward(experiment)[rows]
+    assert torch.equal(shuffled.reward(experiment), expected)
+
+
+@given(scenes(), experiments, st.floats(0, 1))
+def test_coming_nearer_and_sparing_the_others_never_costs(
+    scene: Scene, experiment: catalog.Experiment, share: float
+) -> None:
+    reward = scene.reward(experiment)
+    assert (scene.reward(experiment, distance=share * scene.distance) >= reward).all()
+    spared = torch.zeros_like(scene.wrong_once)
+    assert (scene.reward(experiment, wrong_once=spared) >= reward).all()
+    others = torch.ones_like(scene.contact).scatter(
+        2, scene.target[:, None, None].expand(-1, 6, 1), False
+    )
+    alone = scene.contact & ~others
+    assert (scene.reward(experiment, contact=alone) >= reward - 1e-6).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("reach_scale", 0.0), ("wrong", -1.0), ("reach", math.nan), ("spoiled", math.inf)],
+)
+def test_weights_that_cannot_work_are_refused(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"dense_weights: got {name}={value}"):
+        DenseWeights(**{name: value})

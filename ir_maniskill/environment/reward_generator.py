@@ -5,6 +5,7 @@ Nothing here knows the simulator. Legend: N envs, F fingers, C objects.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -64,6 +65,19 @@ class DenseWeights:
     spoiled: float = 0.25
     """Share of the touch reward that is left once another object has been touched in
     the episode: what makes touching only the named object worth learning."""
+
+    def __post_init__(self) -> None:
+        """Check the fields.
+
+        Raises:
+            ValueError: A weight is negative or not finite, or `reach_scale` is 0.
+        """
+        for name, value in vars(self).items():
+            if not (0 <= value < math.inf and (value or name != "reach_scale")):
+                raise ValueError(
+                    f"dense_weights: got {name}={value!r}, expected a finite number of "
+                    "at least 0 (reach_scale: more than 0)"
+                )
 
 
 def dense_reward(
