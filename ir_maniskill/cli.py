@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import logging
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -17,6 +18,7 @@ from tyro.conf import Positional, arg, subcommand
 
 from ir_maniskill import doctor
 from ir_maniskill import experiment as catalog
+from ir_maniskill.agent.agent import Agent
 from ir_maniskill.experiment import Experiment
 from ir_maniskill.training import distributed, plots, video
 from ir_maniskill.training.checkpoint import load_policy
@@ -65,6 +67,8 @@ class Evaluate:
     """Task, e.g. NaoTouchCubeSingle-v1."""
     checkpoint: Path | None = None
     """Policy or checkpoint file; None: the one that ships with the package."""
+    any_task: bool = False
+    """Accept a policy that was trained for another task."""
     episodes: int = 100
     """Episodes, spread evenly over the instructions."""
     seed: int = 2_000_000
@@ -85,6 +89,8 @@ class Video:
     """Task, e.g. NaoTouchCubeSingle-v1."""
     checkpoint: Path | None = None
     """Policy or checkpoint file; None: the one that ships with the package."""
+    any_task: bool = False
+    """Accept a policy that was trained for another task."""
     out: Path | None = None
     """File to write; None: runs/ID.mp4."""
     episodes: int = 3
@@ -128,8 +134,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line and exits with its code.
 
     The code is 0 if all went well, 1 if the doctor found a fault, 2 for a request that
-    cannot be carried out, and 130 after Ctrl-C.
+    cannot be carried out, and 130 after Ctrl-C or SIGTERM.
     """
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     warnings.filterwarnings("ignore", module=r"(mani_skill|sapien|gymnasium)\b.*")
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))
@@ -235,7 +242,7 @@ def _evaluate(command: Evaluate) -> int:
     _require("seed", command.seed, least=0)
     chosen = _find_instruction(task, command.instruction)
     path = _find_policy(task, command.checkpoint)
-    agent, config, facts = load_policy(path)
+    agent, config, facts = _load(path, task, command.any_task)
     report = evaluate_policy(
         agent.policy,
         task.id,
@@ -262,7 +269,8 @@ def _video(command: Video) -> int:
     if not 0.05 <= command.speed <= 4:
         raise UsageError(f"--speed: got {command.speed:g}, expected 0.05 to 4")
     chosen = _find_instruction(task, command.instruction)
-    agent, config, _ = load_policy(_find_policy(task, command.checkpoint))
+    path = _find_policy(task, command.checkpoint)
+    agent, config, _ = _load(path, task, command.any_task)
     out = command.out or Path("runs") / f"{task.id}.mp4"
     video.check_name(out)
     snapshots = video.record(
@@ -319,6 +327,19 @@ def _find_policy(task: Experiment, given: Path | None) -> Path:
             f"add --checkpoint runs/{task.id}/best.safetensors"
         )
     return shipped
+
+
+def _load(
+    path: Path, task: Experiment, any_task: bool
+) -> tuple[Agent, TrainConfig, dict[str, Any]]:
+    """Returns what `load_policy` does, of a policy for this task."""
+    agent, config, facts = load_policy(path)
+    if config.env_id != task.id and not any_task:
+        raise UsageError(
+            f"{path}: got a policy for {config.env_id}, expected one for {task.id}; "
+            "name that task, or add --any-task to see what it does in this one"
+        )
+    return agent, config, facts
 
 
 def _find_instruction(task: Experiment, text: str | None) -> tuple[int, ...] | None:

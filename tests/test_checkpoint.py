@@ -1,11 +1,21 @@
 import dataclasses
+import io
 import json
+import math
+import os
+import pickle
 import random
+import resource
+from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.torch
 import torch
-from toy_envs import toy_config
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+from toy_envs import ToyVectorEnv, toy_config
 
 from ir_maniskill.agent import Agent, StateSpec
 from ir_maniskill.training import checkpoint
@@ -19,6 +29,9 @@ from ir_maniskill.training.config import (
     from_json,
     to_json,
 )
+from ir_maniskill.training.finite import TrainingDivergedError
+from ir_maniskill.training.run_folder import RunFolder
+from ir_maniskill.training.train import Trainer
 
 SPEC = StateSpec(2, 3, 0, 0, 0, 2, 2, 7, 2)
 
@@ -74,6 +87,37 @@ def test_a_missing_field_is_named():
         from_json(json.dumps(data))
 
 
+def replace_leaf(data, path, value):
+    """Return JSON data with another value at a path of keys."""
+    if not path:
+        return value
+    return data | {path[0]: replace_leaf(data[path[0]], path[1:], value)}
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+    max_leaves=4,
+)
+FIELDS = [
+    *((f.name,) for f in dataclasses.fields(TrainConfig)),
+    *(("agent", f.name) for f in dataclasses.fields(AgentConfig)),
+    *(("ppo", f.name) for f in dataclasses.fields(PPOConfig)),
+]
+
+
+@given(st.sampled_from(FIELDS), JSON)
+def test_whatever_a_config_says_it_is_a_config_or_refused(path, value):
+    data = replace_leaf(json.loads(to_json(TrainConfig())), path, value)
+    try:
+        config = from_json(json.dumps(data))
+    except ConfigError as error:
+        assert "got" in str(error)
+        return
+    assert from_json(to_json(config)) == config
+    assert config.steps_per_update > 0
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -81,7 +125,7 @@ def test_a_missing_field_is_named():
             lambda: AgentConfig(senses=("smell",)),
             "senses: got 'smell'",
         ),
-        (lambda: AgentConfig(vision="resnet"), "'strided', 'paper'"),
+        (lambda: AgentConfig(vision="resnet"), "'patches', 'paper'"),
         (lambda: AgentConfig(language_heads=3), "language_width: got 50.*3 heads"),
         (lambda: AgentConfig(std=0.0), "std: got 0.0, expected more than 0"),
         (lambda: PPOConfig(gamma=1.1), "gamma: got 1.1, expected 0 to 1"),
@@ -182,40 +226,169 @@ def test_a_crash_while_writing_leaves_the_old_file(trained, tmp_path, monkeypatc
     assert [file.name for file in tmp_path.iterdir()] == ["policy"]
 
 
+def write_both(folder, agent, optimizer, config):
+    """Write a policy and a checkpoint of the same agent; return their paths."""
+    paths = folder / "policy", folder / "checkpoint"
+    checkpoint.save_policy(paths[0], agent, config, steps=1, evaluation={}, half=True)
+    facts = checkpoint.describe(agent, config, steps=1)
+    packed = checkpoint.pack(agent, optimizer)
+    checkpoint.write(paths[1], Stored(checkpoint.CHECKPOINT, packed, facts))
+    return paths
+
+
 def test_500_mutated_files_each_get_the_one_clear_error(trained, tmp_path):
-    agent, _, config = trained
-    path = tmp_path / "policy"
-    checkpoint.save_policy(path, agent, config, steps=1, evaluation={}, half=True)
-    good, generator = path.read_bytes(), random.Random(0)
-    header = 8 + int.from_bytes(good[:8], "little")
-    for case in range(500):
-        data, kind = bytearray(good), case % 5
-        place = generator.randrange(header if kind < 2 else len(data))
-        if kind == 0:  # one bit, in the header
-            data[place] ^= 1 << generator.randrange(8)
-        elif kind == 1:  # some bytes, in the header
-            data[place : place + 4] = generator.randbytes(4)
-        elif kind == 2:  # cut short
-            del data[place:]
-        elif kind == 3:  # one bit, anywhere
-            data[place] ^= 1 << generator.randrange(8)
-        else:  # something in between
-            data[place:place] = generator.randbytes(generator.randrange(1, 64))
-        if data == good:
-            continue
-        path.write_bytes(data)
-        with pytest.raises(CheckpointError):
-            checkpoint.load_policy(path)
+    generator = random.Random(0)
+    for path in write_both(tmp_path, *trained):
+        good = path.read_bytes()
+        header = 8 + int.from_bytes(good[:8], "little")
+        for case in range(250):
+            data, kind = bytearray(good), case % 5
+            place = generator.randrange(header if kind < 2 else len(data))
+            if kind == 0:  # one bit, in the header
+                data[place] ^= 1 << generator.randrange(8)
+            elif kind == 1:  # some bytes, in the header
+                data[place : place + 4] = generator.randbytes(4)
+            elif kind == 2:  # cut short
+                del data[place:]
+            elif kind == 3:  # one bit, anywhere
+                data[place] ^= 1 << generator.randrange(8)
+            else:  # something in between
+                data[place:place] = generator.randbytes(generator.randrange(1, 64))
+            if data == good:
+                continue
+            path.write_bytes(data)
+            with pytest.raises(CheckpointError):
+                checkpoint.load_policy(path)
+
+
+WRONG = (None, True, -1, 0, 10**4, 2**40, 2**80, 0.5, 1e308, math.nan, "x", [], {})
+"""Values that do not belong where they are put."""
+
+
+def distort(stored, generator):
+    """Return the contents with something in them that does not belong there."""
+    tensors, metadata = dict(stored.tensors), json.loads(json.dumps(stored.metadata))
+    if generator.random() < 0.3:
+        name = generator.choice(sorted(tensors))
+        tensor = tensors.pop(name)
+        replacements = (
+            tensor.reshape(-1)[:-1],
+            tensor[None],
+            tensor.long(),
+            tensor * 0,
+        )
+        replacement = generator.choice((None, *replacements))
+        if replacement is not None:
+            tensors[generator.choice((name, "agent", "x.y"))] = replacement
+        return Stored(stored.kind, tensors, metadata)
+    node = metadata
+    while True:
+        key = generator.choice(
+            sorted(node) if isinstance(node, dict) else range(len(node))
+        )
+        inner = node[key]
+        if not isinstance(inner, dict | list) or not inner or generator.random() < 0.2:
+            break
+        node = inner
+    node[key] = generator.choice(WRONG)
+    return Stored(stored.kind, tensors, metadata)
+
+
+def test_500_files_of_wrong_values_but_right_checksums_work_or_get_the_error(
+    trained, tmp_path
+):
+    generator, refused = random.Random(0), 0
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for path in write_both(tmp_path, *trained):
+        stored = checkpoint.read(path)
+        for _ in range(250):
+            checkpoint.write(path, distort(stored, generator))
+            try:
+                agent, *_ = checkpoint.load_policy(path)
+                assert agent.policy(make_state()).isfinite().all()
+            except CheckpointError:
+                refused += 1
+            except ValueError as error:  # its weights fit, the state does not
+                assert "this agent was made for" in str(error)
+    assert refused > 100
+    after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert after - before < 300_000, "sizes were believed before they were checked [KB]"
+
+
+def png():
+    buffer = io.BytesIO()
+    Image.new("RGB", (8, 8)).save(buffer, "png")
+    return buffer.getvalue()
 
 
 @pytest.mark.parametrize(
-    "data", [b"", b"PK\x03\x04 a zip", b"\xff" * 64, b"\x02" + b"\0" * 7]
+    "data",
+    [
+        b"",
+        b"PK\x03\x04 a zip",
+        b"\xff" * 64,
+        b"\x02" + b"\0" * 7,
+        pickle.dumps({"agent": 1}),
+        png(),
+        safetensors.torch.save({"weight": torch.zeros(2)}),
+        safetensors.torch.save({"weight": torch.zeros(2)}, {"kind": "another"}),
+    ],
 )
 def test_foreign_files_are_refused(tmp_path, data):
     path = tmp_path / "foreign"
     path.write_bytes(data)
     with pytest.raises(CheckpointError, match="not ours"):
         checkpoint.load_policy(path)
+
+
+def test_little_is_read_of_a_large_foreign_file(tmp_path, monkeypatch):
+    path = tmp_path / "large.safetensors"
+    path.write_bytes(safetensors.torch.save({"weight": torch.zeros(1000)}))
+    monkeypatch.setattr(Path, "read_bytes", lambda _: pytest.fail("read it all"))
+    with pytest.raises(CheckpointError, match="not ours"):
+        checkpoint.load_policy(path)
+
+
+def test_what_is_no_file_is_refused_without_waiting(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", tmp_path, Path("/dev/zero")):
+        with pytest.raises(CheckpointError, match="expected a file"):
+            checkpoint.load_policy(path)
+
+
+def test_numbers_that_are_not_finite_are_neither_written_nor_read(
+    trained, tmp_path, monkeypatch
+):
+    agent, _, config = trained
+    path = tmp_path / "policy"
+    checkpoint.save_policy(path, agent, config, steps=1, evaluation={})
+    with torch.no_grad():
+        agent.actor.mean[0].bias[0] = torch.nan
+    with pytest.raises(TrainingDivergedError, match="checkpoint .*actor.mean.0.bias"):
+        checkpoint.save_policy(path, agent, config, steps=2, evaluation={})
+    assert checkpoint.read(path).metadata["steps"] == 1
+    monkeypatch.setattr(checkpoint, "check_finite", lambda *_: None)
+    checkpoint.save_policy(path, agent, config, steps=2, evaluation={})
+    with pytest.raises(CheckpointError, match=r"actor.mean.0.bias is not finite"):
+        checkpoint.load_policy(path)
+
+
+def test_a_checkpoint_of_wrong_values_is_resumed_or_refused(tmp_path):
+    config, generator = toy_config(tmp_path), random.Random(1)
+    folder = RunFolder(tmp_path, resume=False)
+    folder.begin(config, 0)
+    trainer = Trainer(config, ToyVectorEnv(8), folder)
+    trainer.update()
+    stored, refused = trainer.snapshot(), 0
+    for _ in range(100):
+        checkpoint.write(folder.last, distort(stored, generator))
+        try:
+            trainer.restore()
+        except CheckpointError:
+            refused += 1
+        assert trainer.steps >= 0
+    assert 20 < refused < 100
+    folder.close()
 
 
 def test_a_pickle_is_never_executed(tmp_path):

@@ -3,6 +3,8 @@ import json
 
 import pytest
 import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from ir_maniskill import cli, experiment
 from ir_maniskill.agent.agent import Agent, StateSpec
@@ -60,6 +62,13 @@ def test_a_file_that_is_no_checkpoint_is_refused(tmp_path, capsys):
     path = tmp_path / "junk.safetensors"
     path.write_bytes(b"junk")
     assert str(path) in fails(capsys, "video", IDS[0], "--checkpoint", str(path))
+
+
+@pytest.mark.parametrize("command", ["evaluate", "video"])
+def test_a_policy_of_another_task_is_refused(command, policy_file, capsys):
+    line = fails(capsys, command, IDS[5], "--checkpoint", str(policy_file))
+    assert f"got a policy for {IDS[0]}, expected one for {IDS[5]}" in line
+    assert "--any-task" in line
 
 
 def test_without_a_policy_the_error_tells_how_to_train(capsys, monkeypatch, tmp_path):
@@ -131,6 +140,19 @@ def test_options_override_the_preset(monkeypatch):
     assert config.ppo.clip == CONFIGS["paper"].ppo.clip
 
 
+FLAGS = [f"--{f.name.replace('_', '-')}" for f in dataclasses.fields(TrainConfig)[2:]]
+
+
+@settings(max_examples=40, suppress_health_check=list(HealthCheck))
+@given(st.sampled_from(FLAGS), st.text(max_size=8) | st.integers().map(str))
+def test_whatever_a_number_is_set_to_it_is_taken_or_refused(monkeypatch, flag, text):
+    monkeypatch.setattr(cli, "train", lambda config, resume: None)
+    try:
+        assert cli.run(["train", IDS[0], flag, text]) in (0, 2)
+    except SystemExit as stop:
+        assert stop.code in (0, 2)
+
+
 def test_errors_of_many_lines_are_told_in_one(monkeypatch, capsys):
     def fail(*_, **__):
         raise RuntimeError("worker 1 failed:\nTraceback ...\n  File\nKeyError: 'x'")
@@ -156,7 +178,8 @@ def test_evaluate_prints_a_table_and_writes_json(
     monkeypatch.setattr(multi_vec, "close", lambda: None)
     out, task = tmp_path / "report.json", "NaoTouchCubeMulti-v1"
     options = ["--episodes", "3", "--seed", "5", "--json", str(out)]
-    assert cli.run(["evaluate", task, "--checkpoint", str(policy_file), *options]) == 0
+    policy = ["--checkpoint", str(policy_file), "--any-task"]
+    assert cli.run(["evaluate", task, *policy, *options]) == 0
     assert "Touch the blue cube." in capsys.readouterr().out
     data = json.loads(out.read_text())
     assert data["episodes"] == 3 and data["seed"] == 5 and data["trained_steps"] == 7

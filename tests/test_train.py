@@ -224,6 +224,20 @@ def test_divergence_keeps_the_last_good_checkpoint(tmp_path, monkeypatch):
     assert all(v.isfinite().all() for v in stored.tensors.values())
 
 
+def test_a_reward_that_is_no_number_is_named(tmp_path):
+    envs = ToyVectorEnv(8)
+    step = envs.step
+
+    def explode(action):
+        obs, reward, *rest = step(action)
+        return obs, reward / 0, *rest
+
+    envs.step = explode
+    with pytest.raises(TrainingDivergedError, match=r"outcome .*: reward; .*unstable"):
+        train(toy_config(tmp_path), envs=envs)
+    assert checkpoint.read(tmp_path / "last.safetensors").metadata["steps"] == 0
+
+
 def test_the_noise_shrinks_as_steps_are_made(tmp_path):
     run(toy_config(tmp_path))
     got = [float(row["std"]) for row in rows(tmp_path, "metrics")]

@@ -11,7 +11,7 @@ import hashlib
 import json
 import os
 import random
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,13 +24,24 @@ from safetensors.torch import save as format_tensors
 from torch import Tensor
 
 from ir_maniskill.agent.agent import Agent, StateSpec
-from ir_maniskill.training.config import ConfigError, TrainConfig, decode
+from ir_maniskill.training.config import TrainConfig, decode
+from ir_maniskill.training.finite import check_finite
 
 CHECKPOINT = "ir_maniskill checkpoint 1"
 POLICY = "ir_maniskill policy 1"
 
 TRAINING_ONLY = ("critic.", "critic_encoder.", "locator.")
 """Weights that a policy file leaves out."""
+
+
+MALFORMED = (
+    *(SafetensorError, RuntimeError, RecursionError, MemoryError),
+    *(ValueError, TypeError, AttributeError, LookupError, ArithmeticError),
+)
+"""What reading contents that are not as we write them may raise."""
+
+LONGEST_HEADER = 100_000_000
+"""Longest header that safetensors itself accepts [byte]."""
 
 
 class CheckpointError(RuntimeError):
@@ -54,22 +65,41 @@ def write(path: Path, stored: Stored) -> None:
 
     Raises:
         CheckpointError: if it cannot be written; the file there before is untouched.
+        TrainingDivergedError: if a number in it is not finite; likewise.
     """
     tensors = {k: v.detach().cpu().contiguous() for k, v in stored.tensors.items()}
+    check_finite(tensors, "checkpoint", "the learning rate is too high")
     text = json.dumps(stored.metadata)
     header = {"kind": stored.kind, "metadata": text, "digest": _digest(tensors, text)}
-    data = format_tensors(tensors, header)
+    replace(path, format_tensors(tensors, header))
+
+
+def replace(path: Path, data: bytes) -> None:
+    """Put `data` in place of the file, or leave the file as it is if that fails.
+
+    Raises:
+        CheckpointError: if it cannot be written; the file there before is untouched.
+    """
     aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with aside.open("wb") as file:
+        with writing(path), aside.open("wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        aside.replace(path)
-        _sync_folder(path.parent)
-    except OSError as error:
+            aside.replace(path)
+    except CheckpointError:
         with contextlib.suppress(OSError):
             aside.unlink(missing_ok=True)
+        raise
+    _sync_folder(path.parent)
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn whatever keeps `path` from being written into one clear error."""
+    try:
+        yield
+    except OSError as error:
         raise CheckpointError(
             f"cannot write {path}: {error.strerror}; free some space or choose another "
             "folder (what was saved before is intact)"
@@ -82,29 +112,20 @@ def read(path: Path) -> Stored:
     Raises:
         CheckpointError: if the file is missing, foreign, cut short or altered.
     """
+    path = Path(path)
+    if path.exists() and not path.is_file():  # reading a pipe might never end
+        raise CheckpointError(f"cannot read {path}: expected a file")
     try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise CheckpointError(f"cannot read {path}: {error.strerror}") from error
-    try:
-        header = _header(data)
-        if header.get("kind") not in (CHECKPOINT, POLICY):
-            raise ValueError(f"its kind is {header.get('kind')!r}")
+        header = _header(path)
+        data = path.read_bytes()
         tensors = parse_tensors(data)
         if _digest(tensors, header["metadata"]) != header["digest"]:
             raise ValueError("its contents do not match their checksum")
+        _require_finite(tensors)
         return Stored(header["kind"], tensors, json.loads(header["metadata"]))
-    except (
-        SafetensorError,
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        OverflowError,
-        RuntimeError,
-        RecursionError,
-        MemoryError,
-    ) as error:
+    except OSError as error:
+        raise CheckpointError(f"cannot read {path}: {error.strerror}") from error
+    except MALFORMED as error:
         raise CheckpointError(
             f"{path}: got a file that is cut short, altered or not ours "
             f"({_brief(error)}); expected {CHECKPOINT!r} or {POLICY!r}: restore it, or "
@@ -112,12 +133,26 @@ def read(path: Path) -> Stored:
         ) from error
 
 
-def _header(data: bytes) -> dict[str, str]:
-    """Return the metadata of a safetensors file: 8 bytes of length, then JSON."""
-    length = int.from_bytes(data[:8], "little")
-    if not 2 <= length <= len(data) - 8:
-        raise ValueError(f"{len(data)} bytes, with a header of {length}")
-    return json.loads(data[8 : 8 + length])["__metadata__"]
+def _header(path: Path) -> dict[str, str]:
+    """Return the metadata of a safetensors file of ours: 8 bytes of length, then JSON.
+
+    Whatever the file is, little of it is read.
+    """
+    with path.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        length = int.from_bytes(file.read(8), "little")
+        if not 2 <= length <= min(size - 8, LONGEST_HEADER):
+            raise ValueError(f"{size} bytes, with a header of {length}")
+        header = json.loads(file.read(length))["__metadata__"]
+    if header.get("kind") not in (CHECKPOINT, POLICY):
+        raise ValueError(f"its kind is {header.get('kind')!r}")
+    return header
+
+
+def _require_finite(tensors: Mapping[str, Tensor]) -> None:
+    for name, tensor in tensors.items():
+        if tensor.is_floating_point() and not tensor.isfinite().all():
+            raise ValueError(f"{name} is not finite")
 
 
 def _digest(tensors: Mapping[str, Tensor], text: str) -> str:
@@ -188,21 +223,33 @@ def load_policy(path: Path | str) -> tuple[Agent, TrainConfig, dict[str, Any]]:
         CheckpointError: if the file is none of ours, or does not fit its own config.
     """
     stored = read(Path(path))
-    complete = stored.kind == CHECKPOINT
     try:
         config = decode(TrainConfig, stored.metadata["config"])
-        spec = StateSpec(**stored.metadata["spec"])
-        agent = Agent(config.agent, spec, policy_only=not complete)
-        agent.load_state_dict(
-            _under("agent", stored.tensors) if complete else stored.tensors
-        )
-    except (ConfigError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        spec = decode(StateSpec, stored.metadata["spec"])
+        agent = _agent(config, spec, stored)
+    except MALFORMED as error:
         raise CheckpointError(
             f"{path}: its weights and its config do not belong together "
             f"({_brief(error)}); expected a file of this version of ir_maniskill"
         ) from error
-    agent.eval()
-    return agent, config, stored.metadata
+    return agent.eval(), config, stored.metadata
+
+
+def _agent(config: TrainConfig, spec: StateSpec, stored: Stored) -> Agent:
+    """Return the agent with the stored weights.
+
+    Sizes that the file claims take no memory before they are known to be right.
+    """
+    complete = stored.kind == CHECKPOINT
+    weights = _under("agent", stored.tensors) if complete else stored.tensors
+    lists = (config.agent.hidden, config.agent.vision_channels)
+    if max(config.agent.language_layers, *map(len, lists)) > len(weights):
+        raise ValueError("more layers than weights")
+    with torch.device("meta"):
+        agent = Agent(config.agent, spec, policy_only=not complete)
+    single = {k: v.float() if v.is_floating_point() else v for k, v in weights.items()}
+    agent.load_state_dict(single, assign=True)
+    return agent
 
 
 def _brief(error: Exception) -> str:
@@ -253,9 +300,13 @@ def unpack(
 ) -> None:
     """Load what `pack` returned into an agent and its optimizer."""
     agent.load_state_dict(_under("agent", tensors))
+    weights = [w for group in optimizer.param_groups for w in group["params"]]
     averages: dict[int, dict[str, Tensor]] = {}
     for name, tensor in _under("optimizer", tensors).items():
         index, key = name.split(".", 1)
+        shape = weights[int(index)].shape
+        if tensor.ndim and tensor.shape != shape:
+            raise ValueError(f"{name}: got {tuple(tensor.shape)}, expected {shape}")
         averages.setdefault(int(index), {})[key] = tensor
     state = optimizer.state_dict()
     optimizer.load_state_dict(

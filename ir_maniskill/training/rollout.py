@@ -284,6 +284,8 @@ def collect(
         if config.bootstrap and truncated.any():
             final = to(stack.peek(info["final_observation"]), device)
             cut = values_of(agent, final, truncated & ~terminated)
+        outcome = {"reward": reward, "value of the last observation": cut}
+        check_finite(outcome, "outcome", "the simulation became unstable")
         rollout.add_outcome(t, reward, done, cut)
         sums.add(reward, done, info.get("final_info", info))
         state = to(stack.push(obs, done), device)

@@ -1,17 +1,28 @@
 """The folder of a run: its checkpoints, and the record of how it went."""
 
+import contextlib
 import csv
+import fcntl
+import io
+import logging
+import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from torch.utils.tensorboard import SummaryWriter
 
-from ir_maniskill.training.checkpoint import CheckpointError
+from ir_maniskill.training import checkpoint
+from ir_maniskill.training.checkpoint import CheckpointError, Stored
 from ir_maniskill.training.config import TrainConfig, to_json
+
+log = logging.getLogger(__name__)
 
 SPARE_BYTES = 200_000_000
 """Room a run asks for before it starts [byte]: checkpoints and logs."""
+
+TABLES = ("metrics", "evaluations")
+"""The CSV tables of a run."""
 
 
 class RunFolder:
@@ -34,6 +45,8 @@ class RunFolder:
                 f"{path} already holds a run: resume it, or choose another folder"
             )
         self._require_room()
+        self._reserve = path / ".reserve.tmp"
+        self._lock: int | None = None
         self._events: SummaryWriter | None = None
 
     def _require_room(self) -> None:
@@ -54,33 +67,90 @@ class RunFolder:
             )
 
     def begin(self, config: TrainConfig, steps: int) -> None:
-        """Write the config, and drop records of steps that will be made again."""
+        """Write the config, and drop records of steps that will be made again.
+
+        Raises:
+            CheckpointError: if another training is using the folder.
+        """
+        self._take()
+        for leftover in self.path.glob(".*.tmp"):  # of a process that was killed
+            leftover.unlink()
         self._events = SummaryWriter(str(self.path))
-        (self.path / "config.json").write_text(to_json(config) + "\n")
-        for table in self.path.glob("*.csv"):
-            with table.open(newline="") as file:
-                rows = [r for r in csv.DictReader(file) if int(r["steps"]) <= steps]
-            table.unlink()
-            for row in rows:
-                _append(table, row)
+        text = to_json(config) + "\n"
+        checkpoint.replace(self.path / "config.json", text.encode())
+        for table in (self.path / f"{name}.csv" for name in TABLES):
+            if table.exists():
+                rows = [row for row in _rows(table) if int(row["steps"]) <= steps]
+                checkpoint.replace(table, _format(rows, header=True))
+
+    def _take(self) -> None:
+        """Hold the folder until this process ends or calls `close`."""
+        folder = os.open(self.path, os.O_RDONLY)
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(folder)
+            raise CheckpointError(
+                f"{self.path} is in use by another training; wait until it ends, or "
+                "choose another folder"
+            ) from None
+        except OSError:
+            log.warning("%s: cannot be locked; train there only once", self.path)
+        self._lock = folder
+
+    def save(self, snapshot: Stored) -> None:
+        """Write the newest checkpoint, and reserve room for the next one."""
+        checkpoint.write(self.last, snapshot)
+        size = self.last.stat().st_size
+        if snapshot.metadata["steps"] == 0:
+            size *= 3  # the optimizer's two averages are still to come
+        with contextlib.suppress(OSError), self._reserve.open("ab") as file:
+            os.posix_fallocate(file.fileno(), 0, size + 2**20)
+
+    def save_at_last(self, snapshot: Stored) -> None:
+        """Write the checkpoint of a run that has to stop, on a full disk too."""
+        self._reserve.unlink(missing_ok=True)
+        checkpoint.write(self.last, snapshot)
+        log.warning(
+            "stopped at step %d: resume goes on there", snapshot.metadata["steps"]
+        )
 
     def log(self, table: str, steps: int, figures: Mapping[str, float]) -> None:
         """Add a row to the CSV table, and a point to every TensorBoard curve."""
-        _append(self.path / f"{table}.csv", {"steps": steps, **figures})
-        assert self._events is not None, "begin comes first"
-        for name, value in figures.items():
-            self._events.add_scalar(name, value, steps)
+        path = self.path / f"{table}.csv"
+        with checkpoint.writing(path), path.open("ab") as file:
+            row = {"steps": steps, **figures}
+            file.write(_format([row], header=file.tell() == 0))
+            for name, value in figures.items():
+                assert self._events is not None, "begin comes first"
+                self._events.add_scalar(name, value, steps)
 
     def close(self) -> None:
-        """Flush the TensorBoard events."""
+        """Flush the TensorBoard events, and give up what was held."""
         if self._events is not None:
-            self._events.close()
+            with contextlib.suppress(OSError):  # the tables have all that they have
+                self._events.close()
+        if self._lock is not None:
+            self._reserve.unlink(missing_ok=True)
+            os.close(self._lock)
+            self._lock = None
 
 
-def _append(table: Path, row: Mapping[str, object]) -> None:
-    new = not table.exists()
-    with table.open("a", newline="") as file:
-        writer = csv.DictWriter(file, list(row))
-        if new:
+def _rows(table: Path) -> list[dict[str, str]]:
+    """Return the rows of a CSV table but those that were cut short."""
+    with table.open(newline="", errors="replace") as file:
+        lines = [line for line in file if line.endswith("\n")]
+    rows = csv.DictReader(lines)
+    return [row for row in rows if None not in row and None not in row.values()]
+
+
+def _format(rows: Iterable[Mapping[str, object]], *, header: bool) -> bytes:
+    """Return the lines of a CSV table."""
+    text = io.StringIO(newline="")
+    for row in rows:
+        writer = csv.DictWriter(text, list(row))
+        if header:
             writer.writeheader()
+            header = False
         writer.writerow(row)
+    return text.getvalue().encode()

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import json
-import logging
 import math
 import time
 from pathlib import Path
@@ -14,6 +13,7 @@ import torch
 from tqdm import tqdm
 
 from ir_maniskill.agent.agent import Agent, State, StateSpec
+from ir_maniskill.environment.process_vector import WorkerError
 from ir_maniskill.environment.state import StateStack
 from ir_maniskill.environment.vector import make_vec
 from ir_maniskill.experiment import Experiment
@@ -24,8 +24,6 @@ from ir_maniskill.training.distributed import RankError
 from ir_maniskill.training.evaluate import EvaluationReport, evaluate_policy
 from ir_maniskill.training.rollout import RewardScale, Rollout, VectorEnv, collect, to
 from ir_maniskill.training.run_folder import RunFolder
-
-log = logging.getLogger(__name__)
 
 MAY_CHANGE = {
     *("out", "total_steps", "num_workers", "threads", "stop_at_success"),
@@ -42,8 +40,9 @@ def train(
 ) -> Path:
     """Train an agent and return the file of its best policy.
 
-    Ctrl-C keeps a checkpoint of the last complete update and leaves. Where torchrun
-    started several processes, each trains on its share of the envs.
+    Whatever stops it from outside (Ctrl-C, a worker that fails, a full disk) leaves a
+    checkpoint of the last complete update. Where torchrun started several processes,
+    each trains on its share of the envs.
 
     Args:
         config: task, learner, budget and folder.
@@ -55,6 +54,7 @@ def train(
         ConfigError: if the envs cannot be shared evenly among the ranks.
         RankError: if another rank failed.
         TrainingDivergedError: if a number stopped being finite.
+        WorkerError: if a simulator process died or hangs.
     """
     with contextlib.ExitStack() as leaving:
         leaving.enter_context(distributed.group())
@@ -157,13 +157,13 @@ class Trainer:
                     bar.update(size)
                     if self._due(self.config.eval_interval) or self.steps >= total:
                         reached = self._reached(distributed.from_first(self.evaluate))
-                        self.save()  # the evaluation left the scenes in disorder
+                        snapshot = self.snapshot()  # the best score may be new
+                        self.save(snapshot)  # the evaluation left scenes in disorder
                     elif self._due(self.config.checkpoint_interval):
-                        self.save()
-            except (KeyboardInterrupt, RankError):
+                        self.save(snapshot)
+            except (KeyboardInterrupt, RankError, WorkerError, CheckpointError):
                 if not silent:
-                    checkpoint.write(self.folder.last, snapshot)
-                    log.warning("stopped at step %d: resume goes on there", self.steps)
+                    self.folder.save_at_last(snapshot)
                 raise
         distributed.from_first(self.confirm)
 
@@ -221,7 +221,8 @@ class Trainer:
         )
         self._keep(agent, metadata["steps"], report)
         text = json.dumps(report.as_dict(), indent=2)
-        (self.folder.path / "evaluation.json").write_text(text + "\n")
+        path = self.folder.path / "evaluation.json"
+        checkpoint.replace(path, (text + "\n").encode())
 
     def snapshot(self) -> Stored:
         """Return everything the run needs to go on, as of now."""
@@ -236,14 +237,14 @@ class Trainer:
         tensors |= checkpoint.pack(self.agent, self.optimizer)
         return Stored(checkpoint.CHECKPOINT, tensors, metadata)
 
-    def save(self) -> None:
+    def save(self, snapshot: Stored) -> None:
         """Write a complete checkpoint, and go on with fresh scenes as a resumed run."""
-        self._write(self.snapshot())
+        self._write(snapshot)
         self.state = self._fresh_scenes()
 
     def _write(self, snapshot: Stored) -> None:
         """Write the first rank's snapshot as the last checkpoint."""
-        distributed.from_first(lambda: checkpoint.write(self.folder.last, snapshot))
+        distributed.from_first(lambda: self.folder.save(snapshot))
 
     def restore(self) -> None:
         """Go on from the folder's last checkpoint.
@@ -263,8 +264,8 @@ class Trainer:
             checkpoint.set_random_state(stored.tensors, stored.metadata["random"])
             self.reward_scale.load_state_dict(stored.metadata["reward_scale"])
             self.best_score = float(stored.metadata["best_score"])
-            self.steps = int(stored.metadata["steps"])
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            self.steps = _whole_steps(stored.metadata["steps"])
+        except checkpoint.MALFORMED as error:
             if isinstance(error, CheckpointError):
                 raise
             raise CheckpointError(
@@ -351,6 +352,13 @@ def _summary(figures: dict[str, float]) -> str:
     """Return what the progress bar says."""
     reward, success = figures["train/return"], figures["train/success"]
     return f"return {reward:.2f}, success {success:.0%}"
+
+
+def _whole_steps(got: object) -> int:
+    """Return the step count of a checkpoint."""
+    if type(got) is not int or got < 0:
+        raise ValueError(f"steps: got {got!r}, expected a whole number")
+    return got
 
 
 def _entropy(*numbers: int) -> int:

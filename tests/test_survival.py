@@ -1,0 +1,279 @@
+"""Nothing is lost: trainings that are killed, stopped, starved or run out of disk."""
+
+import contextlib
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import killed_training
+import psutil
+import pytest
+import torch
+from toy_envs import LENGTH, ToyVectorEnv, toy_config
+
+from ir_maniskill.environment.process_vector import WorkerError
+from ir_maniskill.environment.vector import make_vec
+from ir_maniskill.training import checkpoint, run_folder
+from ir_maniskill.training import train as training
+from ir_maniskill.training.checkpoint import CheckpointError
+from ir_maniskill.training.config import AgentConfig, PPOConfig, TrainConfig
+from ir_maniskill.training.run_folder import RunFolder
+from ir_maniskill.training.train import train
+
+UPDATE = 32 * LENGTH  # steps of an update of the toy task
+
+
+def steps_of(table):
+    with table.open(newline="") as file:
+        return [int(row["steps"]) for row in csv.DictReader(file)]
+
+
+def saved(folder):
+    return checkpoint.read(folder / "last.safetensors")
+
+
+@pytest.fixture
+def before_update(monkeypatch):
+    """Do something before the gradients of the n-th update."""
+
+    def arrange(count, action):
+        update, calls = training.ppo.update, []
+
+        def patched(*arguments):
+            calls.append(None)
+            if len(calls) == count:
+                action()
+            return update(*arguments)
+
+        monkeypatch.setattr(training.ppo, "update", patched)
+
+    return arrange
+
+
+# -- Killed ----------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_training_killed_25_times_ends_as_one_never_interrupted(
+    tmp_path, monkeypatch
+):
+    (tmp_path / "killed").mkdir()
+    done = subprocess.run(
+        [sys.executable, killed_training.__file__, str(tmp_path / "killed"), "25"],
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        check=True,
+        text=True,
+    )
+    lives = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(lives) == 25
+    assert sum(death == signal.SIGKILL for death, _ in lives) >= 20
+    steps = [steps for _, steps in lives]
+    assert steps == sorted(steps), "a checkpoint was lost"
+    assert len(set(steps)) > 5, "the lives were too short to show anything"
+
+    monkeypatch.setattr(training, "FINAL_EPISODES", 16)
+    killed_training.train(tmp_path / "whole")
+    ends = [saved(tmp_path / name).tensors for name in ("killed", "whole")]
+    assert ends[0].keys() == ends[1].keys()
+    assert all(torch.equal(ends[0][name], ends[1][name]) for name in ends[0])
+    for table in ("metrics.csv", "evaluations.csv"):
+        killed, whole = (steps_of(tmp_path / n / table) for n in ("killed", "whole"))
+        assert killed == whole
+    assert not list((tmp_path / "killed").glob(".*"))
+
+
+def test_rows_cut_short_by_a_kill_are_dropped(tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "FINAL_EPISODES", 16)
+    config = toy_config(tmp_path, total_steps=2 * UPDATE)
+    train(config, envs=ToyVectorEnv(8))
+    table = tmp_path / "metrics.csv"
+    for torn in ("2", "25,0.5", "25,0.5\r\n", "\0\xff"):
+        with table.open("a", newline="", encoding="latin1") as file:
+            file.write(torn)
+        train(config, resume=True, envs=ToyVectorEnv(8))
+        assert steps_of(table) == [UPDATE, 2 * UPDATE]
+
+
+def test_two_trainings_cannot_share_a_folder(tmp_path):
+    config, first = toy_config(tmp_path), RunFolder(tmp_path, resume=False)
+    first.begin(config, 0)
+    second = RunFolder(tmp_path, resume=True)
+    with pytest.raises(CheckpointError, match="in use by another training"):
+        second.begin(config, 0)
+    second.close()
+    first.close()
+    third = RunFolder(tmp_path, resume=True)
+    third.begin(config, 0)
+    third.close()
+
+
+# -- Workers ---------------------------------------------------------------------------
+
+
+def small(out, **changes):
+    """Return a config of the real task that needs no pictures."""
+    senses = ("proprioception", "touch")
+    agent = AgentConfig(senses=senses, critic="separate", auxiliary_weight=0.0)
+    ppo = PPOConfig(rollouts=4, epochs=1, minibatch=None)
+    never = {"checkpoint_interval": 10**8, "eval_interval": 10**8}
+    values = {"out": str(out), "num_envs": 2, "total_steps": 10**7, **never}
+    return TrainConfig(agent=agent, ppo=ppo, **(values | changes))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("blow", "message"),
+    [
+        (signal.SIGKILL, r"worker-1 \(envs 1 to 1\) died with exit code -9"),
+        (signal.SIGSTOP, r"no answer within 1 s from .*worker-1 \(envs 1 to 1\)"),
+    ],
+)
+def test_a_worker_that_dies_or_hangs_is_named_and_no_update_is_lost(
+    tmp_path, before_update, blow, message
+):
+    config = small(tmp_path)
+    kwargs = config.env_kwargs(training=True) | {"render_backend": "none"}
+    envs = make_vec(config.env_id, 2, num_workers=2, sim_backend="physx_cpu", **kwargs)
+
+    def strike():
+        envs._timeout = 1
+        os.kill(envs._processes[1].pid, blow)
+
+    before_update(2, strike)
+    workers = [psutil.Process(process.pid) for process in envs._processes]
+    with contextlib.closing(envs), pytest.raises(WorkerError, match=message):
+        train(config, envs=envs)
+    assert saved(tmp_path).metadata["steps"] == 2 * config.steps_per_update
+    assert not any(worker.is_running() for worker in workers)
+
+
+# -- Ctrl-C ----------------------------------------------------------------------------
+
+
+def shared_memory(pid):
+    """Return the files of shared memory that a process has."""
+    lines = Path(f"/proc/{pid}/maps").read_text().splitlines()
+    return {line.split()[-1] for line in lines if "/dev/shm/" in line}
+
+
+def leave(process, blow):
+    """Stop a training from outside; return its exit code and what it left running."""
+    family = psutil.Process(process.pid).children(recursive=True)
+    memory = shared_memory(process.pid)
+    assert len(family) >= 2
+    assert memory
+    blow(process.pid)
+    code = process.wait(timeout=120)
+    _, alive = psutil.wait_procs(family, timeout=60)
+    return code, [*alive, *(path for path in memory if Path(path).exists())]
+
+
+@pytest.mark.slow
+def test_ctrl_c_and_sigterm_save_and_leave_nothing_running(tmp_path):
+    task, steps = "NaoTouchCubeSingle-v1", small(tmp_path).steps_per_update
+    command = [sys.executable, "-m", "ir_maniskill.cli", "train", task]
+    command += ["--out", str(tmp_path), "--num-envs", "2", "--num-workers", "2"]
+    command += ["--agent.senses", "proprioception", "touch", "--ppo.rollouts", "4"]
+    command += ["--agent.critic", "separate", "--agent.auxiliary-weight", "0"]
+    command += ["--ppo.minibatch", "None", "--ppo.epochs", "1", "--resume"]
+    table, done = tmp_path / "metrics.csv", 0
+    blows = (
+        lambda pid: os.killpg(pid, signal.SIGINT),  # as a terminal does
+        lambda pid: os.kill(pid, signal.SIGTERM),
+    )
+    for blow in blows:
+        process = subprocess.Popen(
+            command, start_new_session=True, stderr=subprocess.DEVNULL
+        )
+        deadline = time.monotonic() + 400
+        while not table.exists() or max(steps_of(table), default=0) < done + steps:
+            assert process.poll() is None, "the training ended by itself"
+            assert time.monotonic() < deadline, "the training did not begin"
+            time.sleep(0.2)
+        assert leave(process, blow) == (130, [])
+        before, done = done, saved(tmp_path).metadata["steps"]
+        assert done >= before + steps
+        assert done == steps_of(table)[-1] or done == steps_of(table)[-2]
+
+
+# -- Disk ------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def disk(folder, options):
+    """Mount a file system in memory, where this process may."""
+    command = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)]
+    try:
+        subprocess.run(command, check=True, capture_output=True)
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("this process may not mount file systems")
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_a_disk_that_fills_up_loses_no_update(tmp_path, monkeypatch, before_update):
+    monkeypatch.setattr(run_folder, "SPARE_BYTES", 0)
+
+    def fill():
+        filler = (tmp_path / "filler").open("wb", buffering=0)
+        with filler, contextlib.suppress(OSError):
+            while True:
+                filler.write(bytes(4096))
+
+    before_update(3, fill)
+    config = toy_config(tmp_path, checkpoint_interval=3 * UPDATE)
+    with (
+        disk(tmp_path, "size=8m"),
+        pytest.raises(CheckpointError, match="cannot write .*No space left on device"),
+    ):
+        try:
+            train(config, envs=ToyVectorEnv(8))
+        finally:
+            assert saved(tmp_path).metadata["steps"] >= 2 * UPDATE
+
+
+def test_the_last_checkpoint_goes_where_room_was_kept(tmp_path, monkeypatch):
+    reserve, sync = tmp_path / ".reserve.tmp", os.fsync
+
+    def full(descriptor):
+        if (tmp_path / "metrics.csv").exists() and reserve.exists():
+            raise OSError(28, "No space left on device")
+        sync(descriptor)
+
+    monkeypatch.setattr(checkpoint.os, "fsync", full)
+    config = toy_config(tmp_path, checkpoint_interval=2 * UPDATE)
+    with pytest.raises(CheckpointError, match=r"cannot write .*last.*No space left"):
+        train(config, envs=ToyVectorEnv(8))
+    assert saved(tmp_path).metadata["steps"] == 2 * UPDATE
+
+
+def test_the_room_that_is_kept_is_enough(tmp_path):
+    folder = RunFolder(tmp_path, resume=False)
+    config = toy_config(tmp_path)
+    folder.begin(config, 0)
+    trainer = training.Trainer(config, ToyVectorEnv(8), folder)
+    folder.save(trainer.snapshot())
+    trainer.update()
+    needed = tmp_path / "later.safetensors"
+    checkpoint.write(needed, trainer.snapshot())
+    kept = tmp_path / ".reserve.tmp"
+    assert kept.stat().st_blocks * 512 >= needed.stat().st_size
+    folder.close()
+    assert not kept.exists()
+
+
+def test_a_read_only_folder_is_refused_before_training(tmp_path):
+    config = toy_config(tmp_path / "run")
+    with (
+        disk(tmp_path, "ro"),
+        pytest.raises(CheckpointError, match="cannot write to .*Read-only file system"),
+    ):
+        train(config, envs=ToyVectorEnv(8))
