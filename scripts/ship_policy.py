@@ -7,6 +7,7 @@ it with its config, figures and the commit to `assets/policies/ID.safetensors`.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import subprocess
 from pathlib import Path
@@ -27,6 +28,7 @@ def ship(run: Path, episodes: int) -> EvaluationReport:
         episodes: Episodes for each instruction.
     """
     agent, config, facts = checkpoint.load_policy(run / "best.safetensors")
+    config = dataclasses.replace(config, out=f"runs/{config.env_id}")
     path = FOLDER / f"{config.env_id}.safetensors"
     path.parent.mkdir(exist_ok=True)
     steps = facts["steps"]
