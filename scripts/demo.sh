@@ -1,9 +1,10 @@
 #!/usr/bin/env bash
 # The demonstration: demo.sh IR_MANISKILL TASK FOLDER EPISODES
 #
-# Trains an agent from camera images, evaluates it, and leaves a video and a learning
-# curve in FOLDER. A run that was interrupted goes on from its last checkpoint; one that
-# is finished is only evaluated and filmed again.
+# Trains an agent that perceives nothing but the sentence and what two cameras see (no
+# joints, no touch), evaluates it, and leaves a video and a learning curve in FOLDER. A
+# run that was interrupted goes on from its last checkpoint; one that is finished is only
+# evaluated and filmed again.
 set -euo pipefail
 
 ir=$1 task=$2 folder=$3 episodes=$4
@@ -15,7 +16,7 @@ if [ -f "$finished" ] && [ -f "$best" ]; then
 else
     echo "Training on $task from camera images: about 7 minutes on two CPU cores, less on"
     echo "more. Ctrl-C is safe: the next 'make demo' goes on from the last checkpoint."
-    "$ir" train "$task" --out "$folder" --resume
+    "$ir" train "$task" --out "$folder" --agent.senses vision --resume
 fi
 
 echo
