@@ -69,7 +69,9 @@ class CameraVision(nn.Module):
                 for i, (into, out) in enumerate(pairs)
             ]
         )
-        self.norms = nn.ModuleList(nn.GroupNorm(1, out, affine=False) for out in channels)
+        self.norms = nn.ModuleList(
+            nn.GroupNorm(1, out, affine=False) for out in channels
+        )
         self.films = nn.ModuleList(
             FiLM(film_width, out) if film_width and i else nn.Identity()
             for i, out in enumerate(channels)
