@@ -21,8 +21,8 @@ from dataclasses import replace
 import ir_maniskill.training.train as loop
 import ir_maniskill.training.video as video
 from ir_maniskill.training.config import CONFIGS, PPOConfig
-loop.FINAL_EPISODES, video.SHARPNESS = 1, 0.1
-small = dict(num_envs=2, num_workers=1, eval_episodes=1, ppo=PPOConfig(rollouts=2,
+loop.FINAL_EPISODES, video.SHARPNESS = 2, 0.1
+small = dict(num_envs=2, num_workers=1, eval_episodes=2, ppo=PPOConfig(rollouts=2,
              epochs=1, minibatch=None), camera_height=32, camera_width=16)
 for name, config in CONFIGS.items():
     CONFIGS[name] = replace(config, **small)

@@ -107,9 +107,9 @@ def record(
         instructions: Which of the experiment's instructions; None: all.
     """
     env = gym.make(env_id, num_envs=1, **(env_kwargs or {}))
-    stage = _Stage(env_id)
+    base: Any = env.unwrapped
+    stage = _Stage(env_id, base.robot_uids)
     try:
-        base: Any = env.unwrapped
         told = tuple(instructions or range(len(base.experiment.sentences)))
         for episode in range(episodes):
             options = {"instruction": told[episode % len(told)]}
@@ -127,7 +127,7 @@ class _Stage:
     what it sees.
     """
 
-    def __init__(self, env_id: str) -> None:
+    def __init__(self, env_id: str, robot: Any) -> None:
         camera = {
             "width": round(VIEW[2] * SHARPNESS),
             "height": round(VIEW[3] * SHARPNESS),
@@ -137,6 +137,7 @@ class _Stage:
         self._env = gym.make(
             env_id,
             num_envs=1,
+            robot_uids=robot,
             obs_mode="none",
             render_mode="rgb_array",
             enable_shadow=True,

@@ -1,0 +1,112 @@
+"""The tutorial's code runs, the API reference has all, the citation is up to date."""
+
+import os
+import re
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import pdoc
+import pytest
+from test_examples import TINY
+from test_nao_urdf import official
+
+import ir_maniskill
+
+ROOT = Path(__file__).parents[1]
+
+# -- The tutorial ----------------------------------------------------------------------
+
+TUTORIAL = (ROOT / "docs" / "tutorial.md").read_text()
+BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```", TUTORIAL, re.M | re.S)
+BUDGET = {"total_steps=60_000": "total_steps=64", "episodes=40": "episodes=2"}
+"""What takes minutes, and what takes seconds instead."""
+THEIR_URDF = "/path/to/nao.urdf"
+
+
+def shell(folder: Path, block: str) -> str:
+    """Run commands as they stand, in a shell whose python trains and films little."""
+    programs = folder / "bin"
+    programs.mkdir(exist_ok=True)
+    (programs / "tiny.py").write_text(TINY)
+    python = f'exec {sys.executable} -W ignore -c "$(cat {programs}/tiny.py)" "$@"'
+    (programs / "python").write_text(f"#!/bin/sh\n{python}\n")
+    (programs / "python").chmod(0o755)
+    path = [str(programs), str(Path(sys.executable).parent), os.environ["PATH"]]
+    done = subprocess.run(
+        ["sh", "-eu", "-c", block],
+        cwd=folder,
+        env={**os.environ, "OMP_NUM_THREADS": "1", "PATH": os.pathsep.join(path)},
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+@pytest.mark.render
+@pytest.mark.slow
+def test_every_block_of_the_tutorial_runs_in_order(tmp_path: Path) -> None:
+    changes = {**BUDGET, THEIR_URDF: str(official(tmp_path / "ros"))}
+    assert all(TUTORIAL.count(old) == 1 for old in changes)
+    said = []
+    for language, text in BLOCKS:
+        for old, new in changes.items():
+            text = text.replace(old, new)
+        if language == "python":
+            (tmp_path / re.match(r"# (\w+\.py)\n", text)[1]).write_text(text)
+        else:
+            assert language == "sh"
+            said.append(shell(tmp_path, text))
+    look, layout, own_nao, poke, learn, show = said
+    assert re.search(r"assets/nao/nao\.urdf\n\['Touch the .*\] \[\[3, 4, 1", look)
+    assert own_nao.startswith(changes[THEIR_URDF])
+    assert re.search(r"m from the nearest shoulder.*\n.*may overlap.*\n$", layout)
+    assert "touched the lemon: True" in poke
+    assert "runs/fruit/best.safetensors" in learn
+    assert re.search(r"^Touch the plum, not the lemon\. +1 ", show, re.M)
+    for name in ("front.png", "fruit.mp4", "runs/fruit/learning_curve.png"):
+        assert (tmp_path / name).stat().st_size > 1000
+
+
+# -- The API reference -----------------------------------------------------------------
+
+
+API = runpy.run_path(str(ROOT / "scripts" / "api_docs.py"))
+MODULES = list(pdoc.extract.walk_specs(API["specs"]()))
+
+
+def silent(doc: pdoc.doc.Doc) -> list[str]:
+    """Return the names of what has no docstring, of `doc` and all defined in it."""
+    mute = [] if doc.docstring.strip() else [doc.fullname]
+    members = doc.members.values() if isinstance(doc, pdoc.doc.Namespace) else ()
+    for member in members:
+        speaks = isinstance(member, pdoc.doc.Class | pdoc.doc.Function)
+        ours = member.taken_from[0] == doc.modulename
+        if speaks and ours and not member.name.startswith("_"):
+            mute += silent(member)
+    return mute
+
+
+def test_all_that_is_public_has_a_docstring() -> None:
+    for name in ("tasks.single", "assets.nao.build", "environment.robot.nao"):
+        assert f"ir_maniskill.{name}" in MODULES
+    mute = [n for m in MODULES for n in silent(pdoc.doc.Module.from_name(m))]
+    assert mute == []
+
+
+def test_the_reference_has_a_page_for_every_module(tmp_path: Path) -> None:
+    API["write"](tmp_path)
+    for module in MODULES:
+        assert (tmp_path / (module.replace(".", "/") + ".html")).is_file()
+    page = (tmp_path / "ir_maniskill" / "experiment.html").read_text()
+    assert "Of each object about the vertical [rad]." in page
+
+
+def test_the_citation_is_of_this_version() -> None:
+    assert (
+        f"\nversion: {ir_maniskill.__version__}\n"
+        in (ROOT / "CITATION.cff").read_text()
+    )
