@@ -55,7 +55,10 @@ def test_every_example_says_how_to_run_it() -> None:
     assert names == [
         "custom_experiment.py",
         "evaluate_and_record.py",
+        "maniskill_ppo.py",
         "random_actions.py",
+        "record_and_replay.py",
+        "sb3_ppo.py",
         "train.py",
         "vector_envs.py",
     ]
@@ -99,6 +102,35 @@ def test_vector_envs_finish_two_episodes_each(tmp_path: Path) -> None:
     out = run(tmp_path, script("vector_envs.py"), "--num-envs", "2")
     assert len(re.findall(r"\d of 2 touched", out)) == 2
     assert "'images': (2, 3, 2, 64, 32, 3)" in out
+
+
+@pytest.mark.render
+@pytest.mark.slow
+def test_recorded_actions_are_replayed_with_pictures(tmp_path: Path) -> None:
+    arguments = ("--episodes", "1", "--obs-mode", "rgb")
+    out = run(tmp_path, script("record_and_replay.py"), *arguments)
+    assert "traj_0: rewards 0, places of objects 0 mm" in out
+    names = {path.name.split(".")[1] for path in tmp_path.rglob("*.h5")}
+    assert names == {"h5", "rgb"}
+
+
+@pytest.mark.render
+@pytest.mark.slow
+def test_maniskills_ppo_layout_trains(tmp_path: Path) -> None:
+    arguments = ("--iterations", "2", "--steps", "32")
+    out = run(tmp_path, script("maniskill_ppo.py"), *arguments)
+    assert len(re.findall(r"step \d+: mean reward \S+, \d of 1 episodes", out)) == 2
+
+
+@pytest.mark.render
+@pytest.mark.slow
+def test_stable_baselines3_trains(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3", reason="needs the extra `sb3`")
+    arguments = ("--steps", "256", "--rollout", "128", "--episodes", "1")
+    out = run(tmp_path, script("sb3_ppo.py"), *arguments)
+    assert re.search(r"total_timesteps +\| 256 ", out)
+    assert re.search(r"\d of 1 episodes touched", out)
+    assert (tmp_path / "runs" / "sb3_ppo.zip").stat().st_size > 1000
 
 
 @pytest.mark.render

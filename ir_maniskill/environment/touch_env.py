@@ -6,7 +6,7 @@ Legend: N envs, b envs being reset, J joints, F fingers, C objects, L tokens.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -36,6 +36,9 @@ from ir_maniskill.experiment import Experiment
 TOUCH_FORCE = 0.01
 """Force from which a contact counts as a touch [N]."""
 
+CONTROL_FREQ = 20
+"""Steps of an episode in a second [Hz]."""
+
 TASK_STATE = ("instruction_index", "success_once", "wrong_once")
 """What of the task belongs to the env state, beside bodies and joint targets."""
 
@@ -57,6 +60,7 @@ class TouchEnv(BaseEnv):
       the touch is what is rewarded; the time limit does.
     """
 
+    metadata: ClassVar = {**BaseEnv.metadata, "render_fps": CONTROL_FREQ}
     SUPPORTED_ROBOTS: tuple[str | type[Robot], ...] = (Nao.uid,)
     SUPPORTED_REWARD_MODES = ("sparse", "dense", "normalized_dense", "none")
     agent: Robot
@@ -108,7 +112,7 @@ class TouchEnv(BaseEnv):
     def _default_sim_config(self) -> SimConfig:
         return SimConfig(
             sim_freq=100,
-            control_freq=20,
+            control_freq=CONTROL_FREQ,
             scene_config=SceneConfig(contact_offset=0.005),
         )
 

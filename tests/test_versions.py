@@ -1,0 +1,104 @@
+"""The range of Python that is stated, and the locked set of what is installed."""
+
+import re
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).parents[1]
+PYPROJECT = (ROOT / "pyproject.toml").read_text()
+PYTHONS = ["3.10", "3.11", "3.12"]
+
+
+# -- Python ----------------------------------------------------------------------------
+
+
+def test_the_range_of_python_is_stated_alike_everywhere() -> None:
+    (stated,) = re.findall(r'^requires-python = "(.+)"$', PYPROJECT, re.MULTILINE)
+    candidates = [f"3.{minor}" for minor in range(6, 20)]
+    assert list(SpecifierSet(stated).filter(candidates)) == PYTHONS
+    assert re.findall(r'"Programming Language :: Python :: (3\.\d+)"', PYPROJECT) == (
+        PYTHONS
+    )
+    first, *others, last = PYTHONS
+    readme = (ROOT / "README.md").read_text()
+    assert f"Python {', '.join([first, *others])} or {last}" in readme
+    assert f"({first} to {last})" in (ROOT / "CONTRIBUTING.md").read_text()
+    assert " | ".join(PYTHONS) in (ROOT / "scripts" / "create_venv.sh").read_text()
+
+
+def test_linter_and_type_checker_refuse_what_the_oldest_python_lacks() -> None:
+    assert f'target-version = "py{PYTHONS[0].replace(".", "")}"' in PYPROJECT
+    assert f'\npython_version = "{PYTHONS[0]}"' in PYPROJECT
+
+
+# -- The locked set --------------------------------------------------------------------
+
+CUDA = ("cuda", "nvidia", "triton")
+"""Beginnings of the names of what torch brings along, exactly pinned, for a GPU."""
+
+
+def pins(python: str | None = None) -> dict[str, SpecifierSet]:
+    """Returns what constraints.txt pins, for this Python or another."""
+    environment = {"python_version": python} if python else None
+    found: dict[str, SpecifierSet] = {}
+    for line in (ROOT / "constraints.txt").read_text().splitlines():
+        if not line.startswith("#"):
+            pin = Requirement(line)
+            if pin.marker is None or pin.marker.evaluate(environment):
+                name = canonicalize_name(pin.name)
+                assert name not in found, f"{name} is pinned twice"
+                found[name] = pin.specifier
+    return found
+
+
+def needed() -> list[tuple[str, Requirement]]:
+    """Returns all that this project's extra `dev` leads to: by whom, and what."""
+    todo, seen = [Requirement("ir-maniskill[dev]")], set()
+    found: list[tuple[str, Requirement]] = []
+    while todo:
+        parent = todo.pop()
+        for extra in ("", *parent.extras):
+            key = (canonicalize_name(parent.name), extra)
+            if key in seen:
+                continue
+            seen.add(key)
+            for line in metadata.requires(parent.name) or []:
+                child = Requirement(line)
+                cuda = parent.name == "torch" and child.name.startswith(CUDA)
+                marker = child.marker
+                if not cuda and (marker is None or marker.evaluate({"extra": extra})):
+                    todo.append(child)
+                    found.append((parent.name, child))
+    return [(by, what) for by, what in found if what.name != "ir-maniskill"]
+
+
+def test_everything_that_is_needed_is_pinned_as_installed() -> None:
+    required = {canonicalize_name(what.name) for _, what in needed()}
+    assert {"mani-skill", "torch", "stable-baselines3", "numpy", "pytest"} <= required
+    pinned = pins()
+    assert sorted(required - pinned.keys()) == []
+    installed = {name: metadata.version(name) for name in required}
+    assert [
+        f"{name} {version}"
+        for name, version in sorted(installed.items())
+        if not pinned[name].contains(version, prereleases=True)
+    ] == []
+
+
+def test_the_pins_are_in_the_ranges_that_are_asked_for() -> None:
+    pinned = pins()
+    for by, what in needed():
+        (pin,) = pinned[canonicalize_name(what.name)]
+        assert what.specifier.contains(pin.version, prereleases=True), f"{by}: {what}"
+
+
+@pytest.mark.parametrize("python", PYTHONS)
+def test_every_python_has_one_exact_version_of_each(python: str) -> None:
+    assert all(re.fullmatch("==[^*]+", str(pin)) for pin in pins(python).values())
+    only_later = pins("3.11").keys() - pins(python).keys()
+    assert only_later <= {"ipython-pygments-lexers"}  # part of IPython 8 on 3.10
