@@ -4,6 +4,8 @@ from importlib.resources import files
 from pathlib import Path
 
 import pytest
+import torch
+from torch import Tensor
 
 from ir_maniskill.training.checkpoint import load_policy
 from ir_maniskill.training.evaluate import evaluate_policy
@@ -42,3 +44,25 @@ def test_a_shipped_policy_does_what_it_is_told(path: Path) -> None:
     )
     assert report.overall.success.value >= 5 / 6
     assert report.overall.touching > 0.6
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("path", [p for p in SHIPPED if "Shuffled" in p.stem])
+def test_where_colors_are_shuffled_a_policy_is_lost_without_its_eyes(
+    path: Path,
+) -> None:
+    agent, config, _ = load_policy(path)
+
+    def blindfolded(state: dict[str, Tensor]) -> Tensor:
+        return agent.policy(state | {"images": torch.zeros_like(state["images"])})
+
+    report = evaluate_policy(
+        blindfolded,
+        config.env_id,
+        episodes=12,
+        seed=3_000_000,
+        num_envs=2,
+        frames=config.frames,
+        env_kwargs=config.env_kwargs(training=False),
+    )
+    assert report.overall.exclusive.value <= 0.5
