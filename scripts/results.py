@@ -112,10 +112,12 @@ def take_in(folder: Path) -> Run:
         if not path.exists():
             raise ResultsError(f"{folder}: got no {path.name}, expected a finished run")
     metrics, evaluations = map(_rows, tables)
+    name = folder.resolve().name
+    config = json.loads((folder / "config.json").read_text())
     seconds = sum(row["time/collect"] + row["time/update"] for row in metrics)
     return Run(
-        name=folder.resolve().name,
-        config=json.loads((folder / "config.json").read_text()),
+        name=name,
+        config={**config, "out": f"runs/{name}"},
         steps=int(metrics[-1]["steps"]),
         minutes=round(seconds / 60, 1),
         evaluations=evaluations,
