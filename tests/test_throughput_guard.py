@@ -111,6 +111,19 @@ def test_a_step_does_everything_once(multi_env, monkeypatch):
 
 
 @pytest.mark.render
+def test_pictures_begun_early_show_the_end_of_the_step(multi_env):
+    multi_env.reset(seed=0)
+    base = multi_env.unwrapped
+    sight = multi_env.step(np.full(26, 0.5, dtype=np.float32))[0]["sensor_data"]
+    anew = base.get_obs()["sensor_data"]
+    base.agent.robot.set_qpos(base.agent.keyframes["rest"].qpos)
+    moved = base.get_obs()["sensor_data"]
+    for name in sight:
+        assert torch.equal(sight[name]["rgb"], anew[name]["rgb"])
+        assert not torch.equal(moved[name]["rgb"], anew[name]["rgb"])
+
+
+@pytest.mark.render
 def test_a_step_calls_few_python_functions(multi_env):
     multi_env.reset()
     action = np.zeros(26, dtype=np.float32)

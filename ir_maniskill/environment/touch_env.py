@@ -98,6 +98,8 @@ class TouchEnv(BaseEnv):
         # ManiSkill warns of robots that are not in here; ours are not the only ones.
         self.SUPPORTED_ROBOTS = (*available_robots(), robot_uids)
         self.dense_weights = replace(DenseWeights(), **(dense_weights or {}))
+        self._colors_only = False  # without a renderer no sensors are set up
+        self._drawing = False  # whether pictures of this very state are under way
         if render_backend == "auto":
             render_backend = "gpu" if torch.cuda.is_available() else "cpu"
         if render_backend not in ("none", None):
@@ -143,6 +145,7 @@ class TouchEnv(BaseEnv):
         super()._setup_sensors(options)
         self._sensor_params: dict | None = None
         wanted = {kind for kind, on in vars(self.obs_mode_struct.visual).items() if on}
+        self._colors_only = wanted == {"rgb"} and not self._sim_device.is_cuda()
         for name, sensor in self._sensors.items():
             pack = sensor.config.shader_config
             drawn = {kind for kinds in pack.texture_names.values() for kind in kinds}
@@ -181,6 +184,7 @@ class TouchEnv(BaseEnv):
         self.agent.robot.set_qpos(qpos)
         self._success_once[env_idx] = False
         self._wrong_once[env_idx] = False
+        self._drawing = False
 
     def _choose_instruction(
         self, env_idx: Tensor, uniform: np.ndarray, forced: int | Tensor | None
@@ -315,14 +319,24 @@ class TouchEnv(BaseEnv):
         return positions(self.objects)
 
     def _get_obs_sensor_data(self, apply_texture_transforms: bool = True) -> dict:
-        kinds = vars(self.obs_mode_struct.visual)
-        colors_only = [kind for kind in kinds if kinds[kind]] == ["rgb"]
-        if self._sim_device.is_cuda() or not (colors_only and apply_texture_transforms):
+        drawing, self._drawing = self._drawing, False
+        if not (self._colors_only and apply_texture_transforms):
             return super()._get_obs_sensor_data(apply_texture_transforms)
-        self.scene.update_render(update_sensors=True, update_human_render_cameras=False)
-        self.capture_sensor_data()
+        if not drawing:
+            self._draw_pictures()
         sensors = self.scene.sensors.items()
         return {name: self._fetch_color(sensor) for name, sensor in sensors}
+
+    def _after_control_step(self) -> None:
+        # Software renderers draw on other cores while contacts are judged here.
+        if self._colors_only:
+            self._draw_pictures()
+            self._drawing = True
+
+    def _draw_pictures(self) -> None:
+        """Have the renderer begin with what all sensors see, and do not wait."""
+        self.scene.update_render(update_sensors=True, update_human_render_cameras=False)
+        self.capture_sensor_data()
 
     def _fetch_color(self, sensor: Camera) -> dict[str, Tensor]:
         """Return the picture that `sensor` drew, as its `get_obs` but not copied.
@@ -330,7 +344,7 @@ class TouchEnv(BaseEnv):
         Torch copies even small pictures on all cores, which wait for each other.
         """
         (camera,) = sensor.camera._render_cameras
-        color = torch.from_numpy(camera.get_picture("Color"))[None]  # [1, H, W, 4]
+        color = torch.from_numpy(camera.get_picture("Color")[None])  # [1, H, W, 4]
         return sensor.config.shader_config.texture_transforms["Color"](color)
 
     def get_sensor_params(self) -> dict:
