@@ -81,7 +81,8 @@ def test_a_training_killed_25_times_ends_as_one_never_interrupted(
     killed_training.train(tmp_path / "whole")
     ends = [saved(tmp_path / name).tensors for name in ("killed", "whole")]
     assert ends[0].keys() == ends[1].keys()
-    assert all(torch.equal(ends[0][name], ends[1][name]) for name in ends[0])
+    for name in ends[0].keys() - {"random.numpy"}:  # never seeded, never drawn from
+        assert torch.equal(ends[0][name], ends[1][name]), name
     for table in ("metrics.csv", "evaluations.csv"):
         killed, whole = (steps_of(tmp_path / n / table) for n in ("killed", "whole"))
         assert killed == whole
