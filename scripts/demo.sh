@@ -14,7 +14,7 @@ finished=$folder/evaluation.json
 if [ -f "$finished" ] && [ -f "$best" ]; then
     echo "A finished run of $task is in $folder (remove it to train anew)."
 else
-    echo "Training on $task from camera images: about 7 minutes on two CPU cores, less on"
+    echo "Training on $task from camera images: about 6 minutes on two CPU cores, less on"
     echo "more. Ctrl-C is safe: the next 'make demo' goes on from the last checkpoint."
     "$ir" train "$task" --out "$folder" --agent.senses vision --resume
 fi
