@@ -27,7 +27,8 @@ def record(task: str, episodes: int, folder: Path) -> Path:
         task,
         obs_mode="none",
         control_mode="pd_joint_target_delta_pos",
-        sensor_configs={"width": 64, "height": 128},  # for replays with pictures
+        # For replays with pictures: these shaders are quick, and draw without light.
+        sensor_configs={"width": 64, "height": 128, "shader_pack": "trivial"},
     )
     env = RecordEpisode(env, str(folder), trajectory_name="recorded", save_video=False)
     for episode in range(episodes):
