@@ -103,7 +103,7 @@ class PPOConfig:
     """Proximal policy optimization."""
 
     rollouts: int = 64
-    """Roll-outs collected for each update."""
+    """Roll-outs collected for each update, over all ranks."""
     rollout_length: int = 32
     """Steps of each roll-out (an episode of 32 steps of 50 ms)."""
     epochs: int = 5
@@ -163,11 +163,11 @@ class TrainConfig:
     total_steps: int = 60_000
     """Environment steps, over all envs; rounded up to whole updates."""
     num_envs: int = 16
-    """Scenes simulated side by side; must divide `ppo.rollouts`."""
+    """Scenes simulated side by side, over all ranks; must divide `ppo.rollouts`."""
     num_workers: int | None = None
-    """Simulator processes on the CPU; None: one a core."""
+    """Simulator processes of each rank on the CPU; None: one a core."""
     threads: int | None = None
-    """Threads of the update; None: one a core."""
+    """Threads of each rank's update; None: one a core."""
     control_mode: str = "pd_joint_target_delta_pos"
     """What an action means: "pd_joint_target_delta_pos" moves the joint targets,
     "pd_joint_pos" sets them (the paper's)."""
