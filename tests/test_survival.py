@@ -190,7 +190,11 @@ def test_ctrl_c_and_sigterm_save_and_leave_nothing_running(tmp_path):
     )
     for blow in blows:
         process = subprocess.Popen(
-            command, start_new_session=True, stderr=subprocess.DEVNULL
+            command,
+            start_new_session=True,
+            stderr=subprocess.DEVNULL,
+            # A shell's background jobs ignore Ctrl-C, and hand that on.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         )
         deadline = time.monotonic() + 400
         while not table.exists() or max(steps_of(table), default=0) < done + steps:
