@@ -2,21 +2,13 @@
 
 import pytest
 import torch
+from trees import leaves
 
 import ir_maniskill
 from ir_maniskill import make_vec
 
 STEPS = 36
 """An episode of 32 steps, and the beginning of the one that follows it by itself."""
-
-
-def leaves(tree: dict, path: str = "") -> dict[str, torch.Tensor]:
-    """Return all tensors of a nested dict by path."""
-    found = {}
-    for name, value in tree.items():
-        inner = isinstance(value, dict)
-        found |= leaves(value, f"{path}{name}/") if inner else {path + name: value}
-    return found
 
 
 def trajectory(task: str, seeds: list[int], row: int) -> list[dict[str, torch.Tensor]]:

@@ -16,6 +16,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 from mani_skill.utils.wrappers.record import RecordEpisode
+from trees import leaves
 
 import ir_maniskill
 from ir_maniskill import experiment as catalog
@@ -41,15 +42,6 @@ def env(request: pytest.FixtureRequest, multi_env: gym.Env) -> Iterator[gym.Env]
     )
     yield env
     env.close()
-
-
-def leaves(tree: dict, path: str = "") -> dict[str, torch.Tensor]:
-    """Return all tensors of a nested dict by path."""
-    found = {}
-    for name, value in tree.items():
-        inner = isinstance(value, dict)
-        found |= leaves(value, f"{path}{name}/") if inner else {path + name: value}
-    return found
 
 
 def actions(count: int, seed: int = 0) -> np.ndarray:

@@ -52,7 +52,8 @@ class AgentConfig:
     """Units of each token's representation."""
     vision: Vision = "patches"
     """"paper": two 5x5 convolutions over the cameras side by side; "patches": a
-    convolution over 4x4 patches of each camera, then 3x3 ones, all normalized."""
+    convolution over 4x4 patches of each camera, then 3x3 ones, all normalized, and
+    so is H_t then."""
     vision_channels: tuple[int, ...] = (32, 32, 32)
     """Channels of the convolutions of "patches"; the second halves the maps."""
     film: bool = True
