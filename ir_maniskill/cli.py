@@ -21,7 +21,7 @@ from ir_maniskill import experiment as catalog
 from ir_maniskill.agent.agent import Agent
 from ir_maniskill.experiment import Experiment
 from ir_maniskill.training import distributed, plots, video
-from ir_maniskill.training.checkpoint import load_policy
+from ir_maniskill.training.checkpoint import load_policy, writing
 from ir_maniskill.training.config import CONFIGS, TrainConfig
 from ir_maniskill.training.evaluate import evaluate_policy, write_report
 from ir_maniskill.training.train import train
@@ -134,9 +134,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command line and exits with its code.
 
     The code is 0 if all went well, 1 if the doctor found a fault, 2 for a request that
-    cannot be carried out, and 130 after Ctrl-C or SIGTERM.
+    cannot be carried out, and 130 after Ctrl-C, SIGTERM or a terminal that is closed.
     """
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is signal.SIG_DFL:  # nohup has SIGHUP ignored
+            signal.signal(number, signal.default_int_handler)
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     warnings.filterwarnings("ignore", module=r"(mani_skill|sapien|gymnasium)\b.*")
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))
@@ -243,6 +245,8 @@ def _evaluate(command: Evaluate) -> int:
     chosen = _find_instruction(task, command.instruction)
     path = _find_policy(task, command.checkpoint)
     agent, config, facts = _load(path, task, command.any_task)
+    if command.json is not None:
+        _require_writable(command.json)
     report = evaluate_policy(
         agent.policy,
         task.id,
@@ -273,6 +277,7 @@ def _video(command: Video) -> int:
     agent, config, _ = _load(path, task, command.any_task)
     out = command.out or Path("runs") / f"{task.id}.mp4"
     video.check_name(out)
+    _require_writable(out)
     snapshots = video.record(
         agent.policy,
         task.id,
@@ -298,6 +303,8 @@ def _bench(command: Bench) -> int:
         raise UsageError(f"--seconds: got {command.seconds:g}, expected up to 600")
     from ir_maniskill.bench import run as bench  # it loads much that others don't need
 
+    if command.json is not None:
+        _require_writable(command.json)
     report = bench.run(command.seconds, command.quick)
     print(report)
     if command.json is not None:
@@ -357,6 +364,16 @@ def _find_instruction(task: Experiment, text: str | None) -> tuple[int, ...] | N
 def _require(name: str, value: int, least: int) -> None:
     if value < least:
         raise UsageError(f"--{name}: got {value}, expected at least {least}")
+
+
+def _require_writable(path: Path) -> None:
+    """Raises before the work is done whose result could not be written."""
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        new = not path.exists()
+        path.open("ab").close()
+        if new:
+            path.unlink()
 
 
 _DESCRIPTION = "InstructRobot: a NAO humanoid learns to touch what a sentence names."

@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import signal
 
 import pytest
 import torch
@@ -10,7 +11,12 @@ from ir_maniskill import cli, experiment
 from ir_maniskill.agent.agent import Agent, StateSpec
 from ir_maniskill.training import evaluate
 from ir_maniskill.training.checkpoint import save_policy
-from ir_maniskill.training.config import CONFIGS, TrainConfig
+from ir_maniskill.training.config import (
+    CONFIGS,
+    AgentConfig,
+    PPOConfig,
+    TrainConfig,
+)
 
 IDS = [
     f"NaoTouch{shape}{kind}-v1"
@@ -96,6 +102,9 @@ def test_an_unknown_instruction_lists_those_there_are(capsys, policy_file):
         (["train", IDS[0], "--num-envs", "7"], "num_envs: got 7"),
         (["train", IDS[0], "--preset", "fast"], "default, paper"),
         (["curve", "/nowhere"], "/nowhere"),
+        (["video", IDS[0], "--out", "/dev/null/film.mp4"], "cannot write /dev/null/f"),
+        (["evaluate", IDS[0], "--json", "/dev"], "cannot write /dev: Is a directory"),
+        (["bench", "--json", "/dev/null/x"], "cannot write /dev/null/x: "),
     ],
 )
 def test_values_out_of_range_are_refused(arguments, message, capsys, policy_file):
@@ -140,7 +149,16 @@ def test_options_override_the_preset(monkeypatch):
     assert config.ppo.clip == CONFIGS["paper"].ppo.clip
 
 
-FLAGS = [f"--{f.name.replace('_', '-')}" for f in dataclasses.fields(TrainConfig)[2:]]
+FLAGS = [
+    f"--{group}{field.name}".replace("_", "-")
+    for group, config in (
+        ("", TrainConfig),
+        ("agent.", AgentConfig),
+        ("ppo.", PPOConfig),
+    )
+    for field in dataclasses.fields(config)
+    if field.name not in ("env_id", "out", "agent", "ppo")
+]
 
 
 @settings(max_examples=40, suppress_health_check=list(HealthCheck))
@@ -168,6 +186,34 @@ def test_ctrl_c_exits_with_130(monkeypatch):
 
     monkeypatch.setattr(cli, "train", interrupt)
     assert cli.run(["train", IDS[0]]) == 130
+
+
+@pytest.fixture
+def signals():
+    """Put the handlers of signals back."""
+    numbers = (signal.SIGTERM, signal.SIGHUP)
+    handlers = [signal.signal(number, signal.SIG_DFL) for number in numbers]
+    yield numbers
+    for number, handler in zip(numbers, handlers, strict=True):
+        signal.signal(number, handler)
+
+
+def code_of_a_training(monkeypatch, number):
+    """Return the exit code of a training that gets a signal."""
+    monkeypatch.setattr(cli, "train", lambda *_, **__: signal.raise_signal(number))
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["train", IDS[0]])
+    return stop.value.code
+
+
+def test_sigterm_and_a_closed_terminal_stop_like_ctrl_c(monkeypatch, signals):
+    for number in signals:
+        assert code_of_a_training(monkeypatch, number) == 130
+
+
+def test_nohup_holds(monkeypatch, signals):
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    assert code_of_a_training(monkeypatch, signal.SIGHUP) == 0
 
 
 @pytest.mark.render

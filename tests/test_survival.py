@@ -209,6 +209,30 @@ def test_ctrl_c_and_sigterm_save_and_leave_nothing_running(tmp_path):
         assert done == steps_of(table)[-1] or done == steps_of(table)[-2]
 
 
+def test_a_second_ctrl_c_does_not_cut_the_saving_short(
+    tmp_path, monkeypatch, before_update
+):
+    write, numbers = checkpoint.write, run_folder.STOPPING
+    # A shell's background jobs ignore Ctrl-C.
+    before = [signal.signal(n, signal.default_int_handler) for n in numbers]
+
+    def write_while_all_want_it_to_stop(*arguments):
+        for number in numbers:
+            signal.raise_signal(number)
+        write(*arguments)
+
+    def stop():
+        monkeypatch.setattr(checkpoint, "write", write_while_all_want_it_to_stop)
+        signal.raise_signal(signal.SIGINT)
+
+    before_update(2, stop)
+    with pytest.raises(KeyboardInterrupt):
+        train(toy_config(tmp_path), envs=ToyVectorEnv(8))
+    assert saved(tmp_path).metadata["steps"] == UPDATE
+    after = [signal.signal(*pair) for pair in zip(numbers, before, strict=True)]
+    assert after == [signal.default_int_handler] * len(numbers)
+
+
 # -- Disk ------------------------------------------------------------------------------
 
 

@@ -42,15 +42,15 @@ def assert_same(first, second):
 
 @pytest.fixture
 def interrupt(monkeypatch):
-    """Make the training stop as if by Ctrl-C in its n-th update."""
+    """Make the training stop in its n-th update, as if by Ctrl-C."""
 
-    def at(count):
+    def at(count, error=KeyboardInterrupt):
         update, calls = training.ppo.update, []
 
         def interrupted(*arguments):
             calls.append(None)
             if len(calls) == count:
-                raise KeyboardInterrupt
+                raise error
             return update(*arguments)
 
         monkeypatch.setattr(training.ppo, "update", interrupted)
@@ -136,9 +136,10 @@ def test_the_same_seed_gives_the_same_weights_and_another_one_others(tmp_path):
     )
 
 
-def test_ctrl_c_keeps_the_last_complete_update(tmp_path, interrupt):
-    interrupt(2)
-    with pytest.raises(KeyboardInterrupt):
+@pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError])
+def test_whatever_stops_it_the_last_complete_update_is_kept(tmp_path, interrupt, error):
+    interrupt(2, error)
+    with pytest.raises(error):
         run(toy_config(tmp_path))
     stored = checkpoint.read(tmp_path / "last.safetensors")
     assert stored.metadata["steps"] == UPDATE

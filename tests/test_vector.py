@@ -1,13 +1,16 @@
 """Vector envs: same numbers as single envs, ends of episodes, failures, leftovers."""
 
 import dataclasses
+import itertools
 import os
 import signal
 import subprocess
 import sys
 import textwrap
 import time
+import types
 from collections.abc import Iterator
+from multiprocessing.connection import wait
 
 import gymnasium as gym
 import numpy as np
@@ -16,6 +19,7 @@ import torch
 
 import ir_maniskill
 from ir_maniskill import experiment as catalog
+from ir_maniskill.environment import process_vector
 from ir_maniskill.environment.process_vector import ProcessVectorEnv, WorkerError
 from ir_maniskill.environment.vector import make_vec
 
@@ -158,6 +162,23 @@ def test_a_hanging_worker_is_named_instead_of_waited_for() -> None:
     os.kill(pid, signal.SIGSTOP)
     envs.close()
     assert not alive(pid)
+
+
+def test_an_hour_in_which_all_were_stopped_is_no_waiting(
+    envs: ProcessVectorEnv, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    envs.reset(seed=0)
+    clock, looks = itertools.count(0, 3600), []
+
+    def look(pipes: list, left: float) -> list:
+        looks.append(left)
+        return wait(pipes, 60) if len(looks) > 1 else []
+
+    ticking = types.SimpleNamespace(monotonic=lambda: next(clock))
+    monkeypatch.setattr(process_vector, "time", ticking)
+    monkeypatch.setattr(process_vector, "wait", look)
+    assert envs.step(torch.zeros(3, 26))[4]["elapsed_steps"].tolist() == [1, 1, 1]
+    assert len(looks) > 1
 
 
 def alive(pid: int) -> bool:

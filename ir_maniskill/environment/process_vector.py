@@ -310,11 +310,13 @@ class ProcessVectorEnv(VectorEnv):
         """Collect one answer from every worker."""
         answers: list = [None] * len(self._pipes)
         pending = set(range(len(self._pipes)))
-        deadline = time.monotonic() + self._timeout
+        left = self._timeout
         while pending:
-            left = max(0.0, deadline - time.monotonic())
-            ready = wait([self._pipes[index] for index in pending], left)
-            if not ready:
+            # In short waits, for none to count an hour that all were stopped (Ctrl-Z).
+            brief, start = min(left, 1.0), time.monotonic()
+            ready = wait([self._pipes[index] for index in pending], brief)
+            left -= min(time.monotonic() - start, brief)
+            if not ready and left <= 0:
                 names = ", ".join(self._describe(index) for index in sorted(pending))
                 raise WorkerError(f"no answer within {self._timeout:g} s from {names}")
             for index in [i for i in pending if self._pipes[i] in ready]:

@@ -7,7 +7,9 @@ import io
 import logging
 import os
 import shutil
-from collections.abc import Iterable, Mapping
+import signal
+import threading
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from torch.utils.tensorboard import SummaryWriter
@@ -23,6 +25,9 @@ SPARE_BYTES = 200_000_000
 
 TABLES = ("metrics", "evaluations")
 """The CSV tables of a run."""
+
+STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""What asks a training to stop."""
 
 
 class RunFolder:
@@ -109,8 +114,9 @@ class RunFolder:
 
     def save_at_last(self, snapshot: Stored) -> None:
         """Write the checkpoint of a run that has to stop, on a full disk too."""
-        self._reserve.unlink(missing_ok=True)
-        checkpoint.write(self.last, snapshot)
+        with _undisturbed():
+            self._reserve.unlink(missing_ok=True)
+            checkpoint.write(self.last, snapshot)
         log.warning(
             "stopped at step %d: resume goes on there", snapshot.metadata["steps"]
         )
@@ -134,6 +140,20 @@ class RunFolder:
             self._reserve.unlink(missing_ok=True)
             os.close(self._lock)
             self._lock = None
+
+
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Ignore a second Ctrl-C, or what a job scheduler sends to make sure."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # signals are not ours to handle
+        return
+    handlers = {s: signal.signal(s, signal.SIG_IGN) for s in STOPPING}
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
 
 def _rows(table: Path) -> list[dict[str, str]]:

@@ -13,15 +13,14 @@ import torch
 from tqdm import tqdm
 
 from ir_maniskill.agent.agent import Agent, State, StateSpec
-from ir_maniskill.environment.process_vector import WorkerError
 from ir_maniskill.environment.state import StateStack
 from ir_maniskill.environment.vector import make_vec
 from ir_maniskill.experiment import Experiment
 from ir_maniskill.training import checkpoint, distributed, ppo
 from ir_maniskill.training.checkpoint import CheckpointError, Stored
 from ir_maniskill.training.config import ConfigError, Sense, TrainConfig, decode
-from ir_maniskill.training.distributed import RankError
 from ir_maniskill.training.evaluate import EvaluationReport, evaluate_policy
+from ir_maniskill.training.finite import TrainingDivergedError
 from ir_maniskill.training.rollout import RewardScale, Rollout, VectorEnv, collect, to
 from ir_maniskill.training.run_folder import RunFolder
 
@@ -40,9 +39,9 @@ def train(
 ) -> Path:
     """Train an agent and return the file of its best policy.
 
-    Whatever stops it from outside (Ctrl-C, a worker that fails, a full disk) leaves a
-    checkpoint of the last complete update. Where torchrun started several processes,
-    each trains on its share of the envs.
+    Whatever stops it (Ctrl-C, a worker that fails, a full disk) leaves a checkpoint of
+    the last complete update; numbers that are not finite leave the one before. Where
+    torchrun started several processes, each trains on its share of the envs.
 
     Args:
         config: task, learner, budget and folder.
@@ -161,8 +160,9 @@ class Trainer:
                         self.save(snapshot)  # the evaluation left scenes in disorder
                     elif self._due(self.config.checkpoint_interval):
                         self.save(snapshot)
-            except (KeyboardInterrupt, RankError, WorkerError, CheckpointError):
-                if not silent:
+            except BaseException as error:
+                diverged = isinstance(error, TrainingDivergedError)
+                if not silent and not diverged:  # then the older one is the good one
                     self.folder.save_at_last(snapshot)
                 raise
         distributed.from_first(self.confirm)
@@ -231,6 +231,7 @@ class Trainer:
             "steps": self.steps,
             "best_score": self.best_score,
             "reward_scale": self.reward_scale.state_dict(),
+            "learning_rate": self.optimizer.param_groups[0]["lr"],
             "random": plain,
         }
         metadata = checkpoint.describe(self.agent, self.config, **facts)
@@ -264,6 +265,8 @@ class Trainer:
             checkpoint.set_random_state(stored.tensors, stored.metadata["random"])
             self.reward_scale.load_state_dict(stored.metadata["reward_scale"])
             self.best_score = float(stored.metadata["best_score"])
+            for group in self.optimizer.param_groups:
+                group["lr"] = float(stored.metadata["learning_rate"])
             self.steps = _whole_steps(stored.metadata["steps"])
         except checkpoint.MALFORMED as error:
             if isinstance(error, CheckpointError):
