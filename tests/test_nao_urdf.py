@@ -213,6 +213,10 @@ def test_missing_meshes_are_named_once_with_where_they_were_sought(
         ('<child link="RForeArm" />', "", "RElbowRoll.*missing <child>"),
         ('rpy="1.8862 0.976662 0.264067"', 'rpy="1 2"', "expected three numbers"),
         ('value="1.04956"', 'value="heavy"', "heavy"),
+        ('value="1.04956"', 'value="nan"', "got nan, expected a finite number"),
+        ('rpy="1.8862 0.976662 0.264067"', 'rpy="1 2 inf"', "expected three numbers"),
+        ('<link name="torso">', "<link>", "a <link> has no name"),
+        ('upper="2.08567"', 'upper="-3"', "got -2.08567 to -3.0, no range"),
         ("<robot ", "<sdf", "not XML"),
     ],
 )

@@ -11,6 +11,7 @@ Frames are 4x4 homogeneous transforms, lengths in [m], angles in [rad].
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -147,11 +148,15 @@ def _joint(given: Element, ours: Element, parent: str, place: np.ndarray) -> Ele
     SubElement(joint, "child", link=_get(ours, "child", "link"))
     _move(joint, place)
     SubElement(joint, "axis", xyz=_text(_axis(given)))
-    limit, wanted = given.find("limit"), {"lower", "upper", "effort", "velocity"}
+    limit, wanted = given.find("limit"), ("lower", "upper", "effort", "velocity")
     turns = given.get("type") == "revolute"
-    if limit is None or not turns or not wanted <= limit.attrib.keys():
+    if limit is None or not turns or not set(wanted) <= limit.attrib.keys():
         limit = _part(ours, "limit")
     joint.append(limit)
+    lower, upper, *_ = (_number(joint, "limit", name) for name in wanted)
+    if lower >= upper:
+        name = given.attrib["name"]
+        raise RobotError(f"<limit> of {name!r}: got {lower} to {upper}, no range")
     return joint
 
 
@@ -225,7 +230,10 @@ _MOMENTS = {
 
 
 def _by_name(parent: Element, tag: str) -> dict[str, Element]:
-    return {element.attrib["name"]: element for element in parent.findall(tag)}
+    found = parent.findall(tag)
+    if any("name" not in element.attrib for element in found):
+        raise RobotError(f"a <{tag}> has no name")
+    return {element.attrib["name"]: element for element in found}
 
 
 def _part(element: Element, tag: str) -> Element:
@@ -245,9 +253,16 @@ def _get(element: Element, tag: str, attribute: str) -> str:
 def _vector(element: Element | None, attribute: str, default: str) -> list[float]:
     text = default if element is None else element.get(attribute, default)
     values = [float(number) for number in text.split()]
-    if len(values) != 3:
+    if len(values) != 3 or not all(map(math.isfinite, values)):
         raise RobotError(f"{attribute}: got {text!r}, expected three numbers")
     return values
+
+
+def _number(element: Element, tag: str, attribute: str) -> float:
+    value = float(_get(element, tag, attribute))
+    if not math.isfinite(value):
+        raise RobotError(f"<{tag}> {attribute}: got {value}, expected a finite number")
+    return value
 
 
 def _frame(element: Element) -> np.ndarray:
@@ -278,9 +293,9 @@ def _motion(joint: Element, angle: float) -> np.ndarray:
 
 def _inertial(element: Element) -> facts.Inertial:
     """Return mass and inertia, as if the element's origin were that of the link."""
-    mass, tensor = float(_get(element, "mass", "value")), np.zeros((3, 3))
+    mass, tensor = _number(element, "mass", "value"), np.zeros((3, 3))
     for name, (i, j) in _MOMENTS.items():
-        tensor[i, j] = tensor[j, i] = float(_get(element, "inertia", name))
+        tensor[i, j] = tensor[j, i] = _number(element, "inertia", name)
     return facts.Inertial(mass, np.zeros(3), tensor)
 
 
