@@ -202,6 +202,29 @@ def test_epochs_stop_once_the_policy_moved_far_enough():
     assert ppo.update(agent, optimizer, rollout, eager)["epochs"] < 20
 
 
+@pytest.mark.parametrize(
+    ("kl", "target", "rate"),
+    [
+        (0.031, 0.015, 1e-4),
+        (0.007, 0.015, 2.25e-4),
+        (0.015, 0.015, 1.5e-4),
+        (9.0, None, 1.5e-4),
+    ],
+)
+def test_the_step_size_follows_how_far_the_policy_moved(kl, target, rate):
+    optimizer = torch.optim.Adam([torch.zeros(1, requires_grad=True)], 1.5e-4)
+    ppo.adapt_rate(optimizer, kl, target)
+    assert optimizer.param_groups[0]["lr"] == pytest.approx(rate)
+
+
+def test_the_step_size_stays_within_its_bounds():
+    optimizer = torch.optim.Adam([torch.zeros(1, requires_grad=True)], 3e-4)
+    for kl, bound in ((1.0, ppo.LOWEST_RATE), (0.0, ppo.HIGHEST_RATE)):
+        for _ in range(20):
+            ppo.adapt_rate(optimizer, kl, 0.015)
+        assert optimizer.param_groups[0]["lr"] == bound
+
+
 def test_the_gradient_is_cut_to_its_longest_length():
     agent, _, rollout = collected(toy_config("x"))
     loss, _ = ppo.ppo_loss(agent, rollout.batch(torch.arange(128)), PPOConfig())

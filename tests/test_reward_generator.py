@@ -81,6 +81,16 @@ def test_dense_reward_adds_reaching_and_takes_wrong_touches() -> None:
     assert reward.tolist() == pytest.approx([at_scale, 0.5 - 0.3, 1.5, 0.5 + 0.2])
 
 
+def test_where_each_finger_counts_all_are_drawn_to_the_named_object() -> None:
+    weights = DenseWeights(reach=0.0, gather=4.0, gather_scale=0.05)
+    count = FingerCount(torch.tensor([0]), torch.tensor([0]))
+    distance = torch.tensor([[0.0, 0.05, 0.5, 0.5]])
+    fresh = torch.tensor([False])
+    drawn = dense_reward(TRIANGLE, count, distance, fresh, weights)
+    assert drawn.item() == pytest.approx(1.0 + (1 - 0.7615942), abs=1e-4)
+    assert dense_reward(LINE, count, distance, fresh, weights).item() == 0
+
+
 def test_highest_reward_bounds_the_dense_one() -> None:
     weights = DenseWeights()
     all_fingers = FingerCount(torch.tensor([6]), torch.tensor([0]))
@@ -166,7 +176,7 @@ def test_rewards_do_not_depend_on_how_envs_fingers_and_objects_are_numbered(
         scene.wrong_once[rows],
     )
     expected = scene.reward(experiment)[rows]
-    assert torch.equal(shuffled.reward(experiment), expected)
+    assert torch.allclose(shuffled.reward(experiment), expected, atol=1e-6)
 
 
 @given(scenes(), experiments, st.floats(0, 1))
@@ -186,7 +196,13 @@ def test_coming_nearer_and_sparing_the_others_never_costs(
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("reach_scale", 0.0), ("wrong", -1.0), ("reach", math.nan), ("spoiled", math.inf)],
+    [
+        ("reach_scale", 0.0),
+        ("gather_scale", 0.0),
+        ("wrong", -1.0),
+        ("reach", math.nan),
+        ("spoiled", math.inf),
+    ],
 )
 def test_weights_that_cannot_work_are_refused(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"dense_weights: got {name}={value}"):

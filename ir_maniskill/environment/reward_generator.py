@@ -60,23 +60,29 @@ class DenseWeights:
     """Reward of bringing a hand to the named object, at most."""
     reach_scale: float = 0.1
     """Distance at which `reach` has fallen to a quarter, about [m]."""
+    gather: float = 4.0
+    """Reward of bringing all fingers to the named object, at most; only where each
+    finger counts."""
+    gather_scale: float = 0.05
+    """Distance at which a finger's part of `gather` has fallen to a quarter [m]."""
     wrong: float = 0.5
     """Taken while another object is touched by any finger."""
     spoiled: float = 0.25
-    """Share of the touch reward that is left once another object has been touched in
-    the episode: what makes touching only the named object worth learning."""
+    """Share of touch and `gather` that is left once another object has been touched
+    in the episode: what makes touching only the named object worth learning."""
 
     def __post_init__(self) -> None:
         """Check the fields.
 
         Raises:
-            ValueError: A weight is negative or not finite, or `reach_scale` is 0.
+            ValueError: A weight is negative or not finite, or a scale is 0.
         """
         for name, value in vars(self).items():
-            if not (0 <= value < math.inf and (value or name != "reach_scale")):
+            scale = name.endswith("_scale")
+            if not (0 <= value < math.inf and (value > 0 or not scale)):
                 raise ValueError(
                     f"dense_weights: got {name}={value!r}, expected a finite number of "
-                    "at least 0 (reach_scale: more than 0)"
+                    "at least 0 (scales: more than 0)"
                 )
 
 
@@ -96,17 +102,21 @@ def dense_reward(
         wrong_once: Whether another object has been touched so far [N] bool.
         weights: How much each term counts.
     """
-    nearest = distance.min(dim=1).values  # [N]
-    reach = weights.reach * (1 - torch.tanh(nearest / weights.reach_scale))
-    wrong = weights.wrong * count.wrong.clamp(max=1)
     kept = torch.where(wrong_once, weights.spoiled, 1.0)  # [N]
     touch = sparse_reward(experiment, count)
-    return torch.where(touch > 0, kept * touch, touch) + reach - wrong
+    touch = torch.where(touch > 0, kept * touch, touch)
+    nearest = distance.min(dim=1).values  # [N]
+    reach = weights.reach * (1 - torch.tanh(nearest / weights.reach_scale))
+    if experiment.reward == "per_finger":
+        near = 1 - torch.tanh(distance / weights.gather_scale)  # [N, F]
+        reach = reach + kept * weights.gather * near.mean(dim=1)
+    return touch + reach - weights.wrong * count.wrong.clamp(max=1)
 
 
 def highest_reward(
     experiment: Experiment, fingers: int, weights: DenseWeights
 ) -> float:
     """Return the largest dense reward that one step can give."""
-    touch = 1.0 if experiment.reward == "binary" else float(fingers)
-    return touch + weights.reach
+    if experiment.reward == "binary":
+        return 1.0 + weights.reach
+    return fingers + weights.reach + weights.gather

@@ -11,6 +11,8 @@ import typing
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
+from ir_maniskill.environment.reward_generator import DenseWeights
+
 Sense = Literal["vision", "proprioception", "touch", "state"]
 Vision = Literal["patches", "paper"]
 CriticInput = Literal["asymmetric", "separate", "shared"]
@@ -112,7 +114,7 @@ class PPOConfig:
     minibatch: int | None = 256
     """Steps of each gradient; None: all of them."""
     learning_rate: float = 3e-4
-    """Adam's step size."""
+    """Adam's step size, at the start if there is a `target_kl`."""
     gamma: float = 0.95
     """Discount of a step."""
     gae_lambda: float = 0.95
@@ -127,6 +129,9 @@ class PPOConfig:
     """Weight of the entropy bonus (only a learned std feels it)."""
     max_kl: float | None = 0.05
     """No further epoch once the policy moved this far [nat]; None: all epochs."""
+    target_kl: float | None = 0.015
+    """How far an epoch should find the policy moved [nat]: Adam's step size shrinks
+    where it is twice as far, and grows where it is half; None: it stays."""
     max_grad_norm: float | None = 0.5
     """Longest gradient; None: any."""
     normalize_reward: bool = True
@@ -146,7 +151,7 @@ class PPOConfig:
             _require(getattr(self, name) > 0, name, getattr(self, name), "more than 0")
         for name in ("value_weight", "entropy_weight"):
             _require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more")
-        for name in ("max_kl", "max_grad_norm"):
+        for name in ("max_kl", "target_kl", "max_grad_norm"):
             value = getattr(self, name)
             _require(value is None or value > 0, name, value, "more than 0, or None")
 
@@ -175,6 +180,8 @@ class TrainConfig:
     reward_mode: str = "dense"
     """Reward to learn from: "sparse" is the paper's, "dense" is shaped toward touching
     the named object alone."""
+    dense_weights: DenseWeights = field(default_factory=DenseWeights)
+    """What counts how much in the dense reward."""
     shader_pack: str | None = "unlit"
     """Shader pack of the cameras: "unlit" paints base colors and is by far the
     cheapest, "minimal" and "default" are lit; None: the task's own."""
@@ -246,12 +253,16 @@ class TrainConfig:
         }
         if self.shader_pack is not None:
             cameras["shader_pack"] = self.shader_pack
-        return {
+        kwargs = {
             "obs_mode": modes.get((sees, state), "state_dict"),
             "control_mode": self.control_mode,
-            "reward_mode": self.reward_mode if training else "sparse",
+            "reward_mode": "sparse",
             "sensor_configs": cameras,
         }
+        if training:
+            kwargs["reward_mode"] = self.reward_mode
+            kwargs["dense_weights"] = dataclasses.asdict(self.dense_weights)
+        return kwargs
 
 
 CONFIGS: dict[str, TrainConfig] = {
@@ -284,6 +295,7 @@ CONFIGS: dict[str, TrainConfig] = {
             bootstrap=False,
             clip=0.25,
             max_kl=None,
+            target_kl=None,
             max_grad_norm=None,
         ),
     ),

@@ -15,6 +15,10 @@ from ir_maniskill.training.rollout import Batch, Rollout
 
 DECIMETER = 0.1
 """Unit of the auxiliary loss [m]: about the spacing of the objects."""
+RATE_CHANGE = 1.5
+"""Factor by which the step size changes, at most once an epoch."""
+LOWEST_RATE, HIGHEST_RATE = 1e-5, 1e-3
+"""Between which the step size stays if it changes."""
 
 
 def update(
@@ -38,12 +42,27 @@ def update(
         means = distributed.gather(means[None]).mean(dim=0)  # all ranks stop alike
         figures = dict(zip(history, means.tolist(), strict=True))
         figures["epochs"] = epoch + 1
+        adapt_rate(optimizer, figures["kl"], config.target_kl)
         if config.max_kl is not None and figures["kl"] > config.max_kl:
             break
     weights = dict(agent.named_parameters())
     check_finite(weights, "weight", "the learning rate is too high")
     figures["explained_variance"] = explained_variance(rollout)
+    figures["learning_rate"] = optimizer.param_groups[0]["lr"]
     return figures
+
+
+def adapt_rate(
+    optimizer: torch.optim.Optimizer, kl: float, target: float | None
+) -> None:
+    """Change the step size if an epoch moved the policy too far, or hardly."""
+    if target is None:
+        return
+    for group in optimizer.param_groups:
+        if kl > 2 * target:
+            group["lr"] = max(group["lr"] / RATE_CHANGE, LOWEST_RATE)
+        elif kl < target / 2:
+            group["lr"] = min(group["lr"] * RATE_CHANGE, HIGHEST_RATE)
 
 
 def minibatches(rollout: Rollout, config: PPOConfig) -> Iterator[Tensor]:
