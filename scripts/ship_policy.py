@@ -1,7 +1,8 @@
 """Ships the best policy of a run with the package: `ship_policy.py runs/NAME`.
 
-Rounds the weights to 16 bits, evaluates the rounded policy on pinned scenes, and writes
-it with its config, figures and the commit to `assets/policies/ID.safetensors`.
+Rounds the weights to 16 bits, evaluates the rounded policy on pinned scenes (and tells
+it, if the task has several sentences, all of them in the same scenes), and writes it with
+its config, figures and the commit to `assets/policies/ID.safetensors`.
 """
 
 from __future__ import annotations
@@ -10,46 +11,59 @@ import argparse
 import dataclasses
 import json
 import subprocess
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+from ir_maniskill import experiment as catalog
 from ir_maniskill.training import checkpoint
-from ir_maniskill.training.evaluate import EvaluationReport, evaluate_policy
+from ir_maniskill.training.evaluate import (
+    EvaluationReport,
+    evaluate_policy,
+    evaluate_scenes,
+)
 
 FOLDER = Path(__file__).parent.parent / "assets" / "policies"
 SEED = 2_000_000
 """Seed of the first episode, apart from those of training and of choosing."""
 
 
-def ship(run: Path, episodes: int) -> EvaluationReport:
+def ship(run: Path, episodes: int, scenes: int) -> EvaluationReport:
     """Round, evaluate and write the best policy of a run.
 
     Args:
         run: Folder of the run.
         episodes: Episodes for each instruction.
+        scenes: Scenes in which to tell it every instruction, if there are several.
     """
     agent, config, facts = checkpoint.load_policy(run / "best.safetensors")
     config = dataclasses.replace(config, out=f"runs/{config.env_id}")
     path = FOLDER / f"{config.env_id}.safetensors"
     path.parent.mkdir(exist_ok=True)
-    steps = facts["steps"]
-    checkpoint.save_policy(path, agent, config, steps=steps, evaluation={}, half=True)
+    save = partial(
+        *(checkpoint.save_policy, path, agent, config), steps=facts["steps"], half=True
+    )
+    save(evaluation={})
     rounded, *_ = checkpoint.load_policy(path)
-    sentences = len(facts["evaluation"]["instructions"])
+    sentences = len(catalog.get(config.env_id).sentences)
+    play: dict[str, Any] = {
+        "seed": SEED,
+        "frames": config.frames,
+        "env_kwargs": config.env_kwargs(training=False),
+        "progress": True,
+    }
     report = evaluate_policy(
-        rounded.policy,
-        config.env_id,
-        episodes=episodes * sentences,
-        seed=SEED,
-        frames=config.frames,
-        env_kwargs=config.env_kwargs(training=False),
-        progress=True,
+        rounded.policy, config.env_id, episodes=episodes * sentences, **play
     )
     figures = {**report.as_dict(), "commit": _commit()}
-    checkpoint.save_policy(
-        path, agent, config, steps=steps, evaluation=figures, half=True
-    )
+    if sentences > 1:
+        same = evaluate_scenes(rounded.policy, config.env_id, scenes=scenes, **play)
+        figures["same_scene"] = {"scenes": scenes, **same.as_dict()}
+    save(evaluation=figures)
+    about = {"run": run.resolve().name, "steps": facts["steps"]}
+    about["training_seed"] = config.seed
     path.with_suffix(".json").write_text(
-        json.dumps({"steps": steps, "seed": config.seed, **figures}, indent=2) + "\n"
+        json.dumps({**about, **figures}, indent=2) + "\n"
     )
     return report
 
@@ -65,5 +79,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, help="folder of the run")
     parser.add_argument("--episodes", type=int, default=200, help="per instruction")
+    parser.add_argument("--scenes", type=int, default=200, help="for all instructions")
     given = parser.parse_args()
-    print(ship(given.run, given.episodes))
+    print(ship(given.run, given.episodes, given.scenes))

@@ -1,3 +1,4 @@
+import contextlib
 import json
 import math
 from types import SimpleNamespace
@@ -5,8 +6,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+import ir_maniskill
 from ir_maniskill.training import evaluate
-from ir_maniskill.training.evaluate import Rate, evaluate_policy
+from ir_maniskill.training.evaluate import Rate, evaluate_policy, evaluate_scenes
 
 STEPS = 4
 SENTENCES = ("Touch the blue cube.", "Touch the red cube.")
@@ -195,6 +197,56 @@ def test_table_has_a_row_for_each_instruction_and_one_for_all():
     assert " 66.7% " in lines[1] and all(
         math.isclose(len(x), 112, abs_tol=12) for x in lines
     )
+
+
+class ObedientEnvs(ScriptedEnvs):
+    """Blue is touched alone where the seed is even, red where 3 does not divide it."""
+
+    def step(self, action):
+        obs, reward, terminated, done, info = super().step(action)
+        obeyed = torch.where(self.told == 0, self.seed % 2 == 0, self.seed % 3 != 0)
+        info.get("final_info", info)["exclusive_success"] = obeyed
+        return obs, reward, terminated, done, info
+
+
+@pytest.mark.parametrize("num_envs", [1, 4, 9])
+def test_a_scene_counts_if_every_sentence_is_obeyed_in_it(num_envs):
+    envs = ObedientEnvs(num_envs)
+    report = evaluate_scenes(still, "S-v1", scenes=9, seed=0, envs=envs)
+    # Of the seeds 0 to 8 the even ones 2, 4 and 8 are no multiples of 3.
+    assert report.exclusive == Rate(3, 9)
+    assert report.pairs == {SENTENCES: Rate(3, 9)}
+    told = {seed: [t for s, t in envs.resets if s == seed] for seed, _ in envs.resets}
+    for each in told.values():
+        assert each == [[0] * num_envs, [1] * num_envs]
+    data = json.loads(json.dumps(report.as_dict()))
+    assert data["exclusive"] == pytest.approx(1 / 3)
+    assert data["pairs"][0]["sentences"] == list(SENTENCES)
+
+
+def test_scenes_are_counted_one_by_one_and_not_on_average():
+    envs = ObedientEnvs(2)
+    report = evaluate_scenes(still, "S-v1", scenes=2, seed=2, envs=envs)
+    # Seed 2 obeys both; seed 3 is odd and a multiple of 3 and obeys neither.
+    assert report.exclusive == Rate(1, 2)
+    with pytest.raises(ValueError, match="got 0, expected at least 1"):
+        evaluate_scenes(still, "S-v1", scenes=0, seed=2)
+
+
+def test_a_seeds_scene_is_the_same_whatever_is_told():
+    envs = ir_maniskill.make_vec(
+        "NaoTouchCubeShuffled-v1", 1, obs_mode="state_dict", render_backend="none"
+    )
+    with contextlib.closing(envs):
+        starts = []
+        for index in range(3):
+            options = {"instruction": torch.tensor([index])}
+            obs, _ = envs.reset(seed=7, options=options)
+            starts.append((obs["agent"]["proprioception"], obs["extra"]))
+    for joints, extra in starts[1:]:
+        assert torch.equal(joints, starts[0][0])
+        assert torch.equal(extra["object_position"], starts[0][1]["object_position"])
+        assert not torch.equal(extra["target_object"], starts[0][1]["target_object"])
 
 
 @pytest.mark.render

@@ -9,11 +9,12 @@ Legend: N envs, E episodes, I instructions.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import math
 import os
 import platform
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -66,6 +67,10 @@ class Rate:
         low = center - half if self.count > 0 else 0.0
         return low, center + half if self.count < n else 1.0
 
+    def as_dict(self, name: str) -> dict[str, Any]:
+        """Returns plain data for JSON."""
+        return {name: self.value, f"{name}_interval": list(self.interval)}
+
     def __str__(self) -> str:
         low, high = self.interval
         return f"{100 * self.value:5.1f}% [{100 * low:4.1f}, {100 * high:5.1f}]"
@@ -92,10 +97,8 @@ class Score:
         """Returns plain data for JSON."""
         return {
             "episodes": self.success.total,
-            "success": self.success.value,
-            "success_interval": list(self.success.interval),
-            "exclusive": self.exclusive.value,
-            "exclusive_interval": list(self.exclusive.interval),
+            **self.success.as_dict("success"),
+            **self.exclusive.as_dict("exclusive"),
             "touching": self.touching,
             "right_fingers": self.right_fingers,
             "wrong_fingers": self.wrong_fingers,
@@ -138,6 +141,35 @@ class EvaluationReport:
             "exclusive [95%]       touching  fingers right/wrong  return"
         )
         return "\n".join([head, *(_row(name, score, width) for name, score in rows)])
+
+
+@dataclass(frozen=True)
+class SceneReport:
+    """How often a policy obeys in one and the same scene, whatever it is told.
+
+    A policy that neither looks nor reads may have every single score by chance or by
+    habit; only one that does both obeys all sentences in a shuffled scene.
+    """
+
+    env_id: str
+    """The task."""
+    seed: int
+    """Seed of the first scene; scene e has seed + e."""
+    exclusive: Rate
+    """Scenes in which it touched the named object alone, for every sentence."""
+    pairs: dict[tuple[str, str], Rate]
+    """The same for every two sentences."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Returns plain data for JSON."""
+        return {
+            "seed": self.seed,
+            **self.exclusive.as_dict("exclusive"),
+            "pairs": [
+                {"sentences": list(pair), **rate.as_dict("exclusive")}
+                for pair, rate in self.pairs.items()
+            ],
+        }
 
 
 def _row(name: str, score: Score, width: int) -> str:
@@ -225,14 +257,8 @@ def evaluate_policy(
     Raises:
         ValueError: Too few episodes, or an instruction that the task does not have.
     """
-    if envs is None:
-        _check_episodes(episodes)
-        # More envs than episodes would only play what nobody counts.
-        envs = make_vec(env_id, min(num_envs, episodes), **(env_kwargs or {}))
-        scope: contextlib.AbstractContextManager[Any] = contextlib.closing(envs)
-    else:
-        scope = contextlib.nullcontext(envs)
-    with scope, one_thread():
+    _check_episodes(episodes)
+    with _opened(envs, env_id, min(num_envs, episodes), env_kwargs) as envs:
         sentences = tuple(envs.experiment.sentences)
         chosen = _choose_instructions(sentences, instructions, episodes)
         told = torch.tensor([chosen[e % len(chosen)] for e in range(episodes)])  # [E]
@@ -244,6 +270,59 @@ def evaluate_policy(
         instructions={sentences[i]: record.score(told == i) for i in chosen},
         overall=record.score(torch.ones(episodes, dtype=torch.bool)),
     )
+
+
+def evaluate_scenes(
+    policy: Policy,
+    env_id: str,
+    *,
+    scenes: int,
+    seed: int,
+    num_envs: int = 8,
+    frames: int = 3,
+    env_kwargs: dict[str, Any] | None = None,
+    envs: VectorEnv | None = None,
+    progress: bool = False,
+) -> SceneReport:
+    """Plays every scene once for each sentence and counts where all are obeyed.
+
+    Args:
+        policy: Acts without noise on the state s_t.
+        env_id: The task.
+        scenes: How many; as many episodes are played for every sentence.
+        seed: Seed of the first scene.
+        num_envs: Envs to make, unless `envs` are given.
+        frames: S, observations stacked into a state.
+        env_kwargs: Keyword arguments for the envs (obs_mode, control_mode, ...).
+        envs: Envs to use, and to leave open, instead of making some.
+        progress: Whether to show a progress bar.
+
+    Raises:
+        ValueError: No scenes.
+    """
+    _check_episodes(scenes)
+    with _opened(envs, env_id, min(num_envs, scenes), env_kwargs) as envs:
+        sentences = tuple(envs.experiment.sentences)
+        obeyed = {}  # [E] bool each
+        for index, sentence in enumerate(sentences):
+            told = torch.full((scenes,), index)
+            record = _play(policy, envs, told, seed, StateStack(frames), progress)
+            obeyed[sentence] = record.exclusive
+    return SceneReport(
+        env_id=env_id,
+        seed=seed,
+        exclusive=_all_of(obeyed.values()),
+        pairs={
+            pair: _all_of(obeyed[sentence] for sentence in pair)
+            for pair in itertools.combinations(sentences, 2)
+        },
+    )
+
+
+def _all_of(obeyed: Iterable[Tensor]) -> Rate:
+    """Returns the share of scenes in which all hold, each [E] bool."""
+    every = torch.stack(list(obeyed)).all(dim=0)
+    return Rate(int(every.sum()), len(every))
 
 
 def write_report(path: Path, report: EvaluationReport, **facts: Any) -> None:
@@ -270,6 +349,22 @@ def machine() -> dict[str, Any]:
     """Returns what the figures were made on."""
     cuda = torch.cuda.get_device_name(0) if torch.cuda.is_available() else None
     return {"platform": platform.platform(), "cpus": os.cpu_count(), "cuda": cuda}
+
+
+@contextlib.contextmanager
+def _opened(
+    envs: VectorEnv | None, env_id: str, num_envs: int, kwargs: dict[str, Any] | None
+) -> Iterator[VectorEnv]:
+    """Lends the envs given, or else some that are closed at the end.
+
+    Callers never make more envs than episodes: those would play what nobody counts.
+    """
+    with contextlib.ExitStack() as stack:
+        if envs is None:
+            envs = make_vec(env_id, num_envs, **(kwargs or {}))
+            stack.enter_context(contextlib.closing(envs))
+        stack.enter_context(one_thread())
+        yield envs
 
 
 def _check_episodes(episodes: int, least: int = 1) -> None:
