@@ -1,8 +1,8 @@
 """Ships the best policy of a run with the package: `ship_policy.py runs/NAME`.
 
-Rounds the weights to 16 bits, evaluates the rounded policy on pinned scenes (and tells
-it, if the task has several sentences, all of them in the same scenes), and writes it with
-its config, figures and the commit to `assets/policies/ID.safetensors`.
+Rounds the weights to 16 bits, evaluates the rounded policy on pinned scenes, tells it
+all sentences of the task in the same ones, and writes it with its config, figures and
+the commit to `assets/policies/ID.safetensors`.
 """
 
 from __future__ import annotations
@@ -40,9 +40,8 @@ def ship(run: Path, episodes: int, scenes: int) -> EvaluationReport:
     config = dataclasses.replace(config, out=f"runs/{config.env_id}")
     path = FOLDER / f"{config.env_id}.safetensors"
     path.parent.mkdir(exist_ok=True)
-    save = partial(
-        *(checkpoint.save_policy, path, agent, config), steps=facts["steps"], half=True
-    )
+    origin = {"steps": facts["steps"], "half": True}
+    save = partial(checkpoint.save_policy, path, agent, config, **origin)
     save(evaluation={})
     rounded, *_ = checkpoint.load_policy(path)
     sentences = len(catalog.get(config.env_id).sentences)

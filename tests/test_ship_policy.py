@@ -1,0 +1,49 @@
+"""A policy ships with the figures of what ships, and with where it comes from."""
+
+import dataclasses
+import json
+from types import SimpleNamespace
+
+import pytest
+import ship_policy
+from toy_envs import toy_config
+
+from ir_maniskill.agent import Agent, StateSpec
+from ir_maniskill.training import checkpoint
+from ir_maniskill.training.evaluate import Rate, SceneReport
+
+TASK = {1: "NaoTouchCubeSingle-v1", 3: "NaoTouchCubeShuffled-v1"}
+
+
+def fake_report(policy, env_id, *, episodes, **_):
+    return SimpleNamespace(as_dict=lambda: {"env_id": env_id, "episodes": episodes})
+
+
+def fake_scenes(policy, env_id, *, scenes, seed, **_):
+    return SceneReport(env_id, seed, Rate(scenes - 1, scenes), {})
+
+
+@pytest.mark.parametrize("sentences", [1, 3])
+def test_a_shipped_policy_has_its_figures_and_origin(tmp_path, monkeypatch, sentences):
+    monkeypatch.setattr(ship_policy, "FOLDER", tmp_path / "policies")
+    monkeypatch.setattr(ship_policy, "_commit", lambda: "0" * 40)
+    monkeypatch.setattr(ship_policy, "evaluate_policy", fake_report)
+    monkeypatch.setattr(ship_policy, "evaluate_scenes", fake_scenes)
+    config = dataclasses.replace(toy_config(tmp_path), env_id=TASK[sentences], seed=5)
+    run = tmp_path / "run5"
+    run.mkdir()
+    agent = Agent(config.agent, StateSpec(2, 3, 0, 0, 0, 2, 2, 7, 2))
+    checkpoint.save_policy(
+        run / "best.safetensors", agent, config, steps=4096, evaluation={}
+    )
+    ship_policy.ship(run, episodes=20, scenes=10)
+    stem = tmp_path / "policies" / TASK[sentences]
+    data = json.loads(stem.with_suffix(".json").read_text())
+    assert (data["run"], data["training_seed"], data["steps"]) == ("run5", 5, 4096)
+    assert data["episodes"] == 20 * sentences
+    assert ("same_scene" in data) == (sentences > 1)
+    if sentences > 1:
+        assert data["same_scene"]["scenes"] == 10
+        assert data["same_scene"]["exclusive"] == 0.9
+    *_, facts = checkpoint.load_policy(stem.with_suffix(".safetensors"))
+    assert facts["evaluation"]["commit"] == "0" * 40 and facts["steps"] == 4096
