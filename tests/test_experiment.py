@@ -1,6 +1,7 @@
 """Experiments are checked where they are made, and the catalog keeps them apart."""
 
 import dataclasses
+import itertools
 import json
 import math
 import pickle
@@ -8,7 +9,7 @@ import pickle
 import gymnasium as gym
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 import ir_maniskill
@@ -135,33 +136,70 @@ def test_jitter_is_bounded(field: str) -> None:
         Jitter(**{field: -1})
 
 
-@given(
-    places=st.lists(
-        st.tuples(st.floats(0.0, 0.5), st.floats(-0.4, 0.4)), min_size=1, max_size=4
-    ),
-    jitter=st.floats(0, 0.05),
-)
-def test_whatever_is_accepted_can_be_reached_and_does_not_overlap(
-    places: list[tuple[float, float]], jitter: float
-) -> None:
+Place = tuple[float, float]
+CORNERS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
+RADIUS = 0.04 / math.sqrt(2)  # of the circle around a 4 cm cube, however it is turned
+
+
+@st.composite
+def layouts(draw: st.DrawFn) -> list[Place]:
+    """Draw up to three places, each close to the one before, many near a limit."""
+    ahead = st.floats(0.11, 0.14) | st.floats(0.14, 0.35)
+    places = [(draw(ahead), draw(st.floats(-0.35, 0.35)))]
+    for _ in range(draw(st.integers(0, 2))):
+        away, angle = draw(st.floats(0.03, 0.12)), draw(st.floats(-math.pi, math.pi))
+        x, y = places[-1]
+        places.append((x + away * math.cos(angle), y + away * math.sin(angle)))
+    return places
+
+
+def worst(wherever: list[list[Place]]) -> dict[str, float]:
+    """Return by how much each rule is kept at worst [m]; negative: it is broken.
+
+    Args:
+        wherever: For each object, the places where it may come to lie.
+    """
+    anywhere = list(itertools.chain(*wherever))
+    arms = [min(math.dist(p, (0, s)) for s in (0.098, -0.098)) for p in anywhere]
+    edges = [min(x - 0.10, 0.40 - x, 0.34 - abs(y)) for x, y in anywhere]
+    pairs = itertools.combinations(wherever, 2)
+    gaps = [math.dist(*places) for pair in pairs for places in itertools.product(*pair)]
+    return {
+        "from the nearest shoulder": 0.255 - max(arms),
+        "not wholly on the table": min(edges) - RADIUS,
+        "may overlap": min(gaps, default=1.0) - 2 * RADIUS,
+    }
+
+
+def lay(places: list[Place], jitter: float) -> None:
+    """Make an experiment with objects there; raises what `Experiment` does."""
     objects = tuple(map(TouchObject, COLORS, places))
+    orders = (Instruction("Go.", objects[0].name),)
+    make(objects=objects, instructions=orders, jitter=Jitter(position=jitter))
+
+
+@given(layouts())
+def test_places_are_refused_if_and_only_if_they_break_a_rule(
+    places: list[Place],
+) -> None:
+    kept = worst([[place] for place in places])
+    assume(all(abs(slack) > 1e-6 for slack in kept.values()))
     try:
-        made = make(
-            objects=objects,
-            instructions=touch_instructions(objects),
-            jitter=Jitter(position=jitter),
-        )
+        lay(places, 0.0)
+    except ExperimentError as error:
+        assert any(kept[rule] < 0 for rule in kept if rule in str(error))
+    else:
+        assert min(kept.values()) > 0
+
+
+@given(layouts(), st.floats(0, 0.03))
+def test_no_jitter_spoils_what_is_accepted(places: list[Place], jitter: float) -> None:
+    try:
+        lay(places, jitter)
     except ExperimentError:
         return
-    for i, a in enumerate(made.objects):
-        x, y = a.position
-        assert x - 0.02 - jitter >= 0.10
-        assert x + 0.02 + jitter <= 0.40
-        nearest = min((x**2 + (y - s) ** 2) ** 0.5 for s in (0.098, -0.098))
-        assert nearest <= 0.255 + 1e-6
-        for b in made.objects[:i]:
-            dx, dy = x - b.position[0], y - b.position[1]
-            assert (dx**2 + dy**2) ** 0.5 > 0.04
+    moved = [[(x + i * jitter, y + j * jitter) for i, j in CORNERS] for x, y in places]
+    assert min(worst(moved).values()) > -1e-6
 
 
 def test_sentences_that_the_learner_cannot_tell_apart_are_refused() -> None:
@@ -189,7 +227,9 @@ def test_whatever_a_field_is_set_to_it_works_or_is_refused(
     sound: Experiment | TouchObject | Jitter, data: st.DataObject
 ) -> None:
     field = data.draw(st.sampled_from([f.name for f in dataclasses.fields(sound)]))
-    value = data.draw(ANYTHING | st.sampled_from(("binary", 0.01, (0.2, -0.1), 40)))
+    value = data.draw(
+        ANYTHING | st.sampled_from(("binary", 0.01, (0.2, -0.1), 32.0, 10**5))
+    )
     try:
         made = dataclasses.replace(sound, **{field: value})
     except ExperimentError as error:
@@ -197,8 +237,9 @@ def test_whatever_a_field_is_set_to_it_works_or_is_refused(
         return
     assert pickle.loads(pickle.dumps(made)) == made  # workers get it like this
     if isinstance(made, Experiment):
-        assert made.episode_steps >= 1
-        assert math.isfinite(made.wrong_penalty)
+        assert isinstance(made.episode_steps, int) and 1 <= made.episode_steps <= 10**4
+        assert 0 <= made.wrong_penalty <= 10
+        assert isinstance(made.shuffled, bool)
         InstructionalSet(made, torch.device("cpu"))
 
 
