@@ -171,7 +171,7 @@ def leave(process, blow):
     assert memory
     blow(process.pid)
     code = process.wait(timeout=120)
-    _, alive = psutil.wait_procs(family, timeout=60)
+    _, alive = psutil.wait_procs(family, timeout=300)  # long only where all are busy
     return code, [*alive, *(path for path in memory if Path(path).exists())]
 
 
