@@ -4,9 +4,9 @@
     python scripts/results.py                  # write from what was taken in before
 
 Taking a run in copies its config, its evaluations and its final figures (some kB) to
-docs/results/runs, so that the page can be written anew without the run's folder. The
-tables stand between markers in docs/results/README.md; all else there is written by
-hand.
+docs/results/runs, so that the pages can be written anew without the run's folder. The
+tables stand between markers in docs/results/README.md and, the short one, in README.md;
+all else there is written by hand.
 """
 
 from __future__ import annotations
@@ -17,16 +17,25 @@ import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.training.config import CONFIGS
 from ir_maniskill.training.plots import Curve, compare
 
+Figures = Mapping[str, Any]
+Cells = tuple[str, ...]
+Pictures = dict[str, dict[str, list["Group"]]]
+
 ROOT = Path(__file__).parent.parent
 FOLDER = ROOT / "docs" / "results"
 POLICIES = ROOT / "assets" / "policies"
+PAGES = (FOLDER / "README.md", ROOT / "README.md")
+"""Whose marked sections are written here."""
 
 PAPER = {
     "NaoTouchCubeSingle-v1": 2.4,
@@ -42,9 +51,11 @@ UNTOLD = (
 """Fields of a config that do not tell one way of learning from another."""
 LAYOUTS = ("Single", "Multi", "Triangle", "Shuffled")
 """Order of the tasks on the page."""
+EXCLUSIVE = "eval/exclusive"
 NOTHING = "*Nothing has been recorded yet.*"
 
-Figures = Mapping[str, Any]
+OBEYS = 0.95
+"""Share of exclusive episodes from which a way of learning counts as successful."""
 
 
 class ResultsError(ValueError):
@@ -74,21 +85,30 @@ class Run:
         return str(self.config["env_id"])
 
     @property
-    def label(self) -> str:
-        """How it learned: the nearest preset, and what differs from it."""
-        mine = _flat(self.config)
-        changes = {
-            name: {k: v for k, v in mine.items() if v != _flat(asdict(config)).get(k)}
-            for name, config in CONFIGS.items()
-        }
-        preset = min(changes, key=lambda name: len(changes[name]))
-        told = [f"{k} {_plain(v)}" for k, v in sorted(changes[preset].items())]
-        return ", ".join([f"`{preset}`", *told])
+    def preset(self) -> str:
+        """Name of the preset that it differs least from."""
+        return min(CONFIGS, key=lambda name: len(self._changes(name)))
 
-    def steps_to(self, fingers: float) -> int | None:
-        """Return after how many steps an evaluation first had that many fingers."""
+    @property
+    def changes(self) -> list[str]:
+        """Fields in which it differs from that preset, and their values."""
+        changes = self._changes(self.preset)
+        return [f"{key} {_plain(value)}" for key, value in sorted(changes.items())]
+
+    @property
+    def label(self) -> str:
+        """How it learned: the preset, and what differs from it."""
+        return ", ".join([f"`{self.preset}`", *self.changes])
+
+    def _changes(self, preset: str) -> dict[str, Any]:
+        theirs = _flat(asdict(CONFIGS[preset]))
+        mine = _flat(self.config).items()
+        return {key: value for key, value in mine if value != theirs.get(key)}
+
+    def steps_to(self, column: str, level: float) -> int | None:
+        """Return after how many steps an evaluation first reached a level."""
         for row in self.evaluations:
-            if row["eval/right_fingers"] >= fingers:
+            if row[column] >= level:
                 return int(row["steps"])
         return None
 
@@ -162,6 +182,98 @@ def _plain(value: Any) -> str:
     return "+".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
+# -- Groups --------------------------------------------------------------------------
+
+
+def tasks() -> list[str]:
+    """Return all tasks, cubes first, in the order of the paper's experiments."""
+
+    def place(task: str) -> tuple[bool, int]:
+        layout = next((i for i, name in enumerate(LAYOUTS) if name in task), -1)
+        return "Button" in task, layout
+
+    return sorted(catalog.available(), key=place)
+
+
+@dataclass(frozen=True)
+class Group:
+    """Runs of a task that differ by their seeds only."""
+
+    runs: Sequence[Run]
+    """At least one, in the order of their seeds."""
+
+    @property
+    def task(self) -> str:
+        """The task they learned."""
+        return self.runs[0].task
+
+    @property
+    def label(self) -> str:
+        """How they learned."""
+        return self.runs[0].label
+
+    @property
+    def scores(self) -> list[Figures]:
+        """The figures of every seed and sentence."""
+        return [s for run in self.runs for s in run.report["instructions"].values()]
+
+    @property
+    def effort(self) -> Cells:
+        """Seeds, steps and minutes as cells."""
+        seeds = ", ".join(str(run.config["seed"]) for run in self.runs)
+        steps = _span(f"{run.steps / 1000:.0f}" for run in self.runs)
+        return seeds, f"{steps} k", _span(f"{run.minutes:.0f}" for run in self.runs)
+
+    @property
+    def episodes(self) -> str:
+        """Episodes of each sentence, at least, as a cell."""
+        return str(min(score["episodes"] for score in self.scores))
+
+    @property
+    def curve(self) -> Curve:
+        """Their learning curve."""
+        return Curve(self.label.replace("`", ""), [r.evaluations for r in self.runs])
+
+    def after(self, steps: float, column: str) -> float:
+        """Return the mean over the seeds of a figure at some step of training."""
+        values = []
+        for rows in self.curve.runs:
+            points = [(row["steps"], row[column]) for row in rows]
+            values.append(np.interp(steps, *zip(*points, strict=True)))
+        return float(np.mean(values))
+
+    def last_step(self) -> float:
+        """Return the last step at which every seed was evaluated."""
+        return min(run.evaluations[-1]["steps"] for run in self.runs)
+
+
+def grouped(runs: Iterable[Run]) -> list[Group]:
+    """Return the runs by task and way of learning, presets as they are first."""
+    order = tasks()
+
+    def place(run: Run) -> tuple[Any, ...]:
+        return order.index(run.task), len(run.changes), run.label
+
+    ordered = sorted(runs, key=lambda run: (*place(run), run.config["seed"]))
+    return [Group(list(group)) for _, group in groupby(ordered, key=place)]
+
+
+def chosen(groups: Iterable[Group], shipped: Mapping[str, Figures]) -> dict[str, Group]:
+    """Return for each task the way of learning that the README speaks of.
+
+    It is that of the shipped policy, or, where that names no run that is kept, the one
+    that differs least from the preset `default`.
+    """
+    found: dict[str, Group] = {}
+    for group in groups:
+        name = shipped.get(group.task, {}).get("run")
+        if any(run.name == name for run in group.runs):
+            found[group.task] = group
+        elif group.runs[0].preset == "default":
+            found.setdefault(group.task, group)
+    return found
+
+
 # -- Tables --------------------------------------------------------------------------
 
 
@@ -223,28 +335,123 @@ def limit_table(oracle: Mapping[str, Figures], policies: Mapping[str, Figures]) 
     return table(head, rows)
 
 
-def seeds_table(runs: Sequence[Run]) -> str:
+def headline_table(groups: Iterable[Group]) -> str:
+    """Return one row for each task: its worst sentence with its worst seed."""
+    head = (
+        *("task", "seeds", "steps", "minutes", "episodes a sentence"),
+        *("success", "exclusive", "touching", "right fingers"),
+    )
+    rows = [
+        (
+            *(f"`{group.task}`", *group.effort),
+            group.episodes,
+            *(_lowest(group.scores, name) for name in ("success", "exclusive")),
+            _worst(group.scores, "touching"),
+            f"{min(score['right_fingers'] for score in group.scores):.2f}",
+        )
+        for group in groups
+    ]
+    return table(head, rows)
+
+
+def seeds_table(groups: Iterable[Group]) -> str:
     """Return, for every way of learning, what its worst seed and sentence reach."""
     head = (
         *("task", "learned with", "seeds", "steps", "minutes", "episodes a sentence"),
         *("success", "exclusive", "touching", "right fingers", "paper's level after"),
     )
-    rows = []
-    for (task, label), group in grouped(runs).items():
-        scores = [s for run in group for s in run.report["instructions"].values()]
-        rows.append(
-            (
-                *(f"`{task}`", label),
-                ", ".join(str(run.config["seed"]) for run in group),
-                _span(f"{run.steps / 1000:.0f}" for run in group) + " k",
-                _span(f"{run.minutes:.0f}" for run in group),
-                str(min(score["episodes"] for score in scores)),
-                *(_worst(scores, name) for name in ("success", "exclusive")),
-                _worst(scores, "touching"),
-                f"{min(score['right_fingers'] for score in scores):.2f}",
-                _reached(group, PAPER.get(task)),
-            )
+    rows = [
+        (
+            *(f"`{group.task}`", group.label, *group.effort),
+            group.episodes,
+            *_reached(group),
+            _steps_to(group, "eval/right_fingers", PAPER.get(group.task)),
         )
+        for group in groups
+    ]
+    return table(head, rows)
+
+
+def ablations(groups: Iterable[Group]) -> dict[str, list[Group]]:
+    """Return for each task the `default` preset and all that differ in one field.
+
+    Tasks with only one of both have nothing to compare and are left out.
+    """
+    found: dict[str, list[Group]] = {}
+    for group in groups:
+        run = group.runs[0]
+        if run.preset == "default" and len(run.changes) <= 1:
+            found.setdefault(group.task, []).append(group)
+    # Groups come with the fewest changes first, so that the preset leads its own.
+    return {
+        task: group
+        for task, group in found.items()
+        if len(group) > 1 and not group[0].runs[0].changes
+    }
+
+
+def ablations_table(groups: Iterable[Group]) -> str:
+    """Return what one field changes: in the end, and after equally many steps."""
+    head = (
+        *("task", "changed", "seeds", "steps", "success", "exclusive", "touching"),
+        *("right fingers", "exclusive after", "this", "default"),
+    )
+    rows = []
+    for task, (default, *others) in ablations(groups).items():
+        for group in (default, *others):
+            steps = min(default.last_step(), group.last_step())
+            same = [f"{100 * g.after(steps, EXCLUSIVE):.0f}%" for g in (group, default)]
+            rows.append(
+                (
+                    f"`{task}`",
+                    ", ".join(group.runs[0].changes) or "nothing",
+                    *group.effort[:2],
+                    *_reached(group),
+                    *(f"{steps / 1000:.0f} k", *same),
+                )
+            )
+    return table(head, rows)
+
+
+def rivals(groups: Sequence[Group]) -> dict[str, tuple[Group, Group]]:
+    """Return for each task that both learned the presets `default` and `paper`."""
+    labels = {(group.task, group.label): group for group in groups}
+    return {
+        task: (labels[task, "`default`"], labels[task, "`paper`"])
+        for task in tasks()
+        if {(task, "`default`"), (task, "`paper`")} <= labels.keys()
+    }
+
+
+def paper_table(groups: Sequence[Group]) -> str:
+    """Return how many steps both presets take to the same levels."""
+    head = ("task", "level", "`default` after", "`paper` after", "of")
+    rows = []
+    for task, (ours, theirs) in rivals(groups).items():
+        levels = [(EXCLUSIVE, OBEYS, f"exclusive in {100 * OBEYS:.0f}% of episodes")]
+        if task in PAPER:
+            text = f"{PAPER[task]:g} right fingers a step, the paper's"
+            levels.append(("eval/right_fingers", PAPER[task], text))
+        for column, level, text in levels:
+            after = [_steps_to(group, column, level) for group in (ours, theirs)]
+            rows.append((f"`{task}`", text, *after, theirs.effort[1]))
+    return table(head, rows)
+
+
+def scenes_table(policies: Mapping[str, Figures]) -> str:
+    """Return how often each shipped policy obeys all sentences in the same scene."""
+    head = ("task", "scenes", "all sentences", "the least of two sentences")
+    rows = [
+        (
+            *(f"`{task}`", str(same["scenes"]), _share(same, "exclusive")),
+            _lowest(same["pairs"], "exclusive"),
+        )
+        for task, same in (
+            (task, figures["same_scene"])
+            for task, figures in policies.items()
+            if "same_scene" in figures
+        )
+    ]
     return table(head, rows)
 
 
@@ -264,34 +471,24 @@ def controls_table(controls: Mapping[str, Figures]) -> str:
     return table(head, rows)
 
 
-def tasks() -> list[str]:
-    """Return all tasks, cubes first, in the order of the paper's experiments."""
-
-    def place(task: str) -> tuple[bool, int]:
-        layout = next((i for i, name in enumerate(LAYOUTS) if name in task), -1)
-        return "Button" in task, layout
-
-    return sorted(catalog.available(), key=place)
-
-
-def grouped(runs: Iterable[Run]) -> dict[tuple[str, str], list[Run]]:
-    """Return the runs by task and way of learning, each group by seed."""
-    order = tasks()
-    groups: dict[tuple[str, str], list[Run]] = {}
-    for run in sorted(runs, key=lambda run: (order.index(run.task), run.label)):
-        groups.setdefault((run.task, run.label), []).append(run)
-    for group in groups.values():
-        group.sort(key=lambda run: run.config["seed"])
-    return groups
-
-
 def _share(score: Figures, name: str) -> str:
     low, high = score[f"{name}_interval"]
     return f"{100 * score[name]:.1f}% [{100 * low:.1f}, {100 * high:.1f}]"
 
 
+def _lowest(scores: Iterable[Figures], name: str) -> str:
+    return _share(min(scores, key=lambda score: score[name]), name)
+
+
 def _worst(scores: Iterable[Figures], name: str) -> str:
     return f"{100 * min(score[name] for score in scores):.1f}%"
+
+
+def _reached(group: Group) -> Cells:
+    """Return what the worst seed and sentence reach, as four cells."""
+    shares = ("success", "exclusive", "touching")
+    fingers = min(score["right_fingers"] for score in group.scores)
+    return (*(_worst(group.scores, name) for name in shares), f"{fingers:.2f}")
 
 
 def _span(numbers: Iterable[str]) -> str:
@@ -312,47 +509,60 @@ def _ratio(
     return bound, reached, f"{score[name] / limit:.2f}"
 
 
-def _reached(group: Sequence[Run], level: float | None) -> str:
-    """Return after how many steps each seed reached the paper's level."""
+def _steps_to(group: Group, column: str, level: float | None) -> str:
+    """Return after how many steps each seed reached the level."""
     if level is None:
         return ""
-    steps = [run.steps_to(level) for run in group]
+    steps = [run.steps_to(column, level) for run in group.runs]
     return ", ".join("not" if n is None else f"{n / 1000:.0f} k" for n in steps)
 
 
 # -- Page ----------------------------------------------------------------------------
 
 
-def draw(runs: Sequence[Run], folder: Path) -> list[str]:
-    """Draw the curves of every task and return the pictures' names."""
-    groups, names = grouped(runs), []
-    for task in dict.fromkeys(task for task, _ in groups):
-        curves = [
-            Curve(label.replace("`", ""), [run.evaluations for run in group])
-            for (other, label), group in groups.items()
-            if other == task
-        ]
-        names.append(f"{task}.png")
-        compare(curves, folder / names[-1], level=PAPER.get(task))
-    return names
+def pictures(groups: Sequence[Group], shipped: Mapping[str, Figures]) -> Pictures:
+    """Return what to draw: the curves in each picture, by section and name."""
+    main = {task: [group] for task, group in chosen(groups, shipped).items()}
+    both = {f"{task}-paper": list(pair) for task, pair in rivals(groups).items()}
+    one = {f"{task}-ablations": each for task, each in ablations(groups).items()}
+    return {"curves": main, "paper": both, "ablations": one}
+
+
+def draw(wanted: Pictures, folder: Path) -> None:
+    """Draw the curves."""
+    for name, groups in (pair for part in wanted.values() for pair in part.items()):
+        curves = [group.curve for group in groups]
+        compare(curves, folder / f"{name}.png", level=PAPER.get(groups[0].task))
 
 
 def sections(folder: Path = FOLDER, policies: Path = POLICIES) -> dict[str, str]:
-    """Return the text of each marked section of the page."""
-    runs = kept(folder)
-    shipped = _ordered({path.stem: _json(path) for path in policies.glob("*.json")})
-    learned = dict.fromkeys(task for task, _ in grouped(runs))
-    pictures = [f"![Learning curves of {task}]({task}.png)" for task in learned]
+    """Return the text of each marked section of the pages."""
+    groups, shipped = grouped(kept(folder)), shipped_figures(policies)
     oracle, controls = (
         _ordered(_json(folder / f"{name}.json")) for name in ("oracle", "controls")
     )
+    shown = {
+        section: "\n\n".join(
+            f"![Learning curves: {name}]({name}.png)" for name in names
+        )
+        for section, names in pictures(groups, shipped).items()
+    }
     return {
+        "headline": headline_table(chosen(groups, shipped).values()),
         "shipped": shipped_table(shipped),
+        "scenes": scenes_table(shipped),
         "limit": limit_table(oracle, shipped),
-        "seeds": seeds_table(runs),
-        "curves": "\n\n".join(pictures) or NOTHING,
+        "curves": shown["curves"] or NOTHING,
+        "seeds": seeds_table(groups),
+        "paper": f"{paper_table(groups)}\n\n{shown['paper']}".rstrip(),
+        "ablations": f"{ablations_table(groups)}\n\n{shown['ablations']}".rstrip(),
         "controls": controls_table(controls),
     }
+
+
+def shipped_figures(policies: Path = POLICIES) -> dict[str, Figures]:
+    """Return the figures of the shipped policies."""
+    return _ordered({path.stem: _json(path) for path in policies.glob("*.json")})
 
 
 def _ordered(figures: Mapping[str, Figures]) -> dict[str, Figures]:
@@ -363,27 +573,31 @@ def fill(page: str, texts: Mapping[str, str]) -> str:
     """Return the page with new text between its markers.
 
     Raises:
-        ResultsError: A section has no markers in the page.
+        ResultsError: A marked section has no text, or a marker no end.
     """
-    for name, text in texts.items():
+    for name in re.findall(r"<!-- begin (\w+) -->", page):
         begin, end = f"<!-- begin {name} -->", f"<!-- end {name} -->"
+        if name not in texts or page.count(begin) != 1 or end not in page:
+            raise ResultsError(
+                f"page: got {begin}, expected it once, before {end}, with one of the "
+                f"names {', '.join(texts)}"
+            )
         pattern = re.compile(f"{re.escape(begin)}.*?{re.escape(end)}", re.DOTALL)
-        new = f"{begin}\n{text}\n{end}"
-        page, count = pattern.subn(lambda _, new=new: new, page)  # type: ignore[misc]
-        if count != 1:
-            raise ResultsError(f"page: got {count} sections {begin}, expected one")
+        new = f"{begin}\n{texts[name]}\n{end}"
+        page = pattern.sub(lambda _, new=new: new, page)  # type: ignore[misc]
     return page
 
 
 def main() -> None:
-    """Take runs in, draw the curves, and write the page's tables."""
+    """Take runs in, draw the curves, and write the pages' tables."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("runs", nargs="*", type=Path, help="folders of finished runs")
     for folder in parser.parse_args().runs:
         keep(take_in(folder))
-    draw(kept(), FOLDER)
-    page = FOLDER / "README.md"
-    page.write_text(fill(page.read_text(encoding="utf-8"), sections()), "utf-8")
+    draw(pictures(grouped(kept()), shipped_figures()), FOLDER)
+    texts = sections()
+    for page in PAGES:
+        page.write_text(fill(page.read_text(encoding="utf-8"), texts), "utf-8")
 
 
 if __name__ == "__main__":

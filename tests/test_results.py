@@ -89,23 +89,84 @@ def test_a_label_is_the_nearest_preset_and_what_differs():
 def test_runs_that_differ_by_seed_only_are_one_group():
     runs = [make_run(seed=1), make_run(preset="paper"), make_run(seed=0)]
     groups = results.grouped(runs)
-    seeds = {
-        key: [run.config["seed"] for run in group] for key, group in groups.items()
-    }
-    assert seeds == {(TRIANGLE, "`default`"): [0, 1], (TRIANGLE, "`paper`"): [0]}
+    assert [(group.label, group.effort[0]) for group in groups] == [
+        ("`default`", "0, 1"),
+        ("`paper`", "0"),
+    ]
 
 
-def test_the_papers_level_is_reached_at_the_first_such_evaluation():
+def test_a_level_is_reached_at_the_first_such_evaluation():
     run = make_run(fingers=(1.0, 3.1, 2.0, 3.5))
-    assert run.steps_to(3.1) == 2000 and run.steps_to(4) is None
+    assert run.steps_to("eval/right_fingers", 3.1) == 2000
+    assert run.steps_to("eval/right_fingers", 4) is None
+
+
+def weak():
+    return {"instructions": {BLUE: score(exclusive=0.25), "b": score(fingers=2.0)}}
+
+
+def cells(text, row=0):
+    return [cell.strip() for cell in text.splitlines()[2 + row].split("|")[1:-1]]
 
 
 def test_the_worst_seed_and_sentence_count():
-    weak = {"instructions": {BLUE: score(exclusive=0.25), "b": score(fingers=2.0)}}
-    text = results.seeds_table([make_run(0), make_run(1, fingers=(1, 2), report=weak)])
-    row = [cell.strip() for cell in text.splitlines()[2].split("|")[1:-1]]
+    runs = [make_run(0), make_run(1, fingers=(1, 2), report=weak())]
+    row = cells(results.seeds_table(results.grouped(runs)))
     assert row[2] == "0, 1"
     assert row[6:] == ["100.0%", "25.0%", "80.0%", "2.00", "2 k, not"]
+    row = cells(results.headline_table(results.grouped(runs)))
+    assert row[:4] == [f"`{TRIANGLE}`", "0, 1", "2 k", "2"]
+    assert row[6:] == ["25.0% [40.0, 60.0]", "80.0%", "2.00"]
+
+
+def test_the_readme_speaks_of_what_ships_or_else_of_what_is_nearest_the_default():
+    groups = results.grouped([make_run(0), make_run(1, reward_mode="sparse")])
+    default, sparse = groups
+    assert results.chosen(groups, {}) == {TRIANGLE: default}
+    shipped = {TRIANGLE: {"run": sparse.runs[0].name}}
+    assert results.chosen(groups, shipped) == {TRIANGLE: sparse}
+    assert results.chosen([sparse], {}) == {TRIANGLE: sparse}
+    assert results.chosen(results.grouped([make_run(preset="paper")]), {}) == {}
+
+
+def changed(seed, **agent):
+    config = json.loads(to_json(CONFIGS["default"]))["agent"]
+    return make_run(seed, agent=config | agent)
+
+
+def test_ablations_are_the_runs_that_differ_from_the_default_in_one_field():
+    far = make_run(8, fingers=(1, 1, 1, 1), reward_mode="sparse")
+    both = changed(7, film=False, auxiliary_weight=0.0)
+    groups = results.grouped(
+        [make_run(0), both, changed(3, film=False), far, make_run(4, "paper")]
+    )
+    (found,) = results.ablations(groups).values()
+    changes = [group.runs[0].changes for group in found]
+    assert changes == [[], ["agent.film False"], ["reward_mode sparse"]]
+    text = results.ablations_table(groups)
+    # Exclusive success grows by 0.1 every 1000 steps; the default stops at 2000.
+    assert cells(text, 0)[1] == "nothing" and cells(text, 2)[3] == "2 k"
+    assert cells(text, 2)[-3:] == ["2 k", "10%", "10%"]
+    assert results.ablations(results.grouped([changed(3, film=False)])) == {}
+    assert results.ablations(results.grouped([make_run(0)])) == {}
+
+
+def test_presets_are_compared_by_the_steps_to_the_same_levels():
+    groups = results.grouped(
+        [make_run(0), make_run(1, fingers=(3.1, 0)), make_run(0, "paper", (0, 0, 3.2))]
+    )
+    text = results.paper_table(groups)
+    assert cells(text, 1)[2:] == ["2 k, 1 k", "3 k", "2 k"]
+    assert cells(text, 0)[2:4] == ["not, not", "not"]
+    assert results.rivals(groups[:1]) == {}
+
+
+def test_a_policy_is_told_every_sentence_in_the_same_scene():
+    pairs = [score(exclusive=0.75), score(exclusive=0.5)]
+    same = score(exclusive=0.25) | {"scenes": 8, "pairs": pairs}
+    text = results.scenes_table({TRIANGLE: {"same_scene": same}, "other": {}})
+    assert cells(text)[1:] == ["8", "25.0% [40.0, 60.0]", "50.0% [40.0, 60.0]"]
+    assert len(text.splitlines()) == 3
 
 
 def test_the_policy_is_compared_with_the_limit_of_its_sentence():
@@ -126,17 +187,30 @@ def test_the_policy_is_compared_with_the_limit_of_its_sentence():
 
 def test_only_what_stands_between_markers_is_written():
     page = "a\n<!-- begin x -->\nold\n<!-- end x -->\nb"
-    new = results.fill(page, {"x": r"\1 new"})
+    new = results.fill(page, {"x": r"\1 new", "y": ""})
     assert new == "a\n<!-- begin x -->\n\\1 new\n<!-- end x -->\nb"
     assert results.fill(new, {"x": r"\1 new"}) == new
-    with pytest.raises(ResultsError, match="got 0 sections"):
-        results.fill(page, {"y": ""})
+    for wrong in (page + page, page.replace("end", "and"), page.replace("x", "z")):
+        with pytest.raises(ResultsError, match="expected it once"):
+            results.fill(wrong, {"x": ""})
 
 
-def test_the_page_is_what_the_recorded_files_say():
+@pytest.mark.parametrize("path", results.PAGES, ids=lambda path: str(path.parent.name))
+def test_a_page_is_what_the_recorded_files_say(path):
     """If this fails, run scripts/results.py."""
-    page = (results.FOLDER / "README.md").read_text(encoding="utf-8")
+    page = path.read_text(encoding="utf-8")
     assert results.fill(page, results.sections()) == page
+
+
+def test_the_pages_have_all_sections():
+    pages = "".join(path.read_text(encoding="utf-8") for path in results.PAGES)
+    assert all(f"<!-- begin {name} -->" in pages for name in results.sections())
+
+
+def test_every_picture_of_the_pages_is_there():
+    groups, shipped = results.grouped(results.kept()), results.shipped_figures()
+    for names in results.pictures(groups, shipped).values():
+        assert all((results.FOLDER / f"{name}.png").is_file() for name in names)
 
 
 def test_seeds_are_averaged_at_every_step_that_each_has_reached():
@@ -150,12 +224,25 @@ def test_seeds_are_averaged_at_every_step_that_each_has_reached():
     assert math.isnan(values[1, 0]) and values[1, 1:].tolist() == [3, 4]
 
 
-def test_curves_are_drawn_for_each_task(tmp_path):
-    names = results.draw([make_run(0), make_run(1), make_run(preset="paper")], tmp_path)
-    assert names == [f"{TRIANGLE}.png"]
-    one = (tmp_path / names[0]).read_bytes()
-    results.draw([make_run(0)], tmp_path)
-    assert (tmp_path / names[0]).read_bytes() != one
+def test_curves_are_drawn_for_each_comparison(tmp_path):
+    runs = [make_run(0), make_run(1), make_run(preset="paper"), changed(3, film=False)]
+    wanted = results.pictures(results.grouped(runs), {})
+    results.draw(wanted, tmp_path)
+    names = [f"{TRIANGLE}{end}.png" for end in ("", "-ablations", "-paper")]
+    assert {path.name for path in tmp_path.iterdir()} == set(names)
+    pictures = {(tmp_path / name).read_bytes() for name in names}
+    assert len(pictures) == 3
+
+
+def test_every_seed_has_a_line_of_its_own(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(
+        plots.Axes, "plot", lambda axes, x, y, *_, **__: drawn.append(y)
+    )
+    runs = [make_run(0).evaluations, make_run(1, fingers=(2.0, 2.2)).evaluations]
+    plots.compare([plots.Curve("a", runs)], tmp_path / "a.png")
+    mean, seeds = drawn[2:]
+    assert np.allclose(mean, [1.5, 2.7]) and np.allclose(seeds, [[1, 2], [3.2, 2.2]])
 
 
 def test_the_band_reaches_from_the_worst_seed_to_the_best(tmp_path, monkeypatch):

@@ -95,7 +95,10 @@ class Curve:
 
 
 def compare(curves: Sequence[Curve], out: Path, level: float | None = None) -> Path:
-    """Draws ways of learning side by side: a line for the mean, a band for the range.
+    """Draws ways of learning side by side.
+
+    Each has a line for the mean of its seeds, a band for their range, and a thin line
+    for every seed.
 
     Args:
         curves: At least one.
@@ -149,6 +152,8 @@ def _draw_range(
     axes.plot(steps, np.nanmean(values, axis=0), "o-", color=color, ms=3, label=label)
     low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
     axes.fill_between(steps, low, high, color=color, alpha=0.18, linewidth=0)
+    if len(values) > 1:
+        axes.plot(steps, values.T, color=color, linewidth=0.7, alpha=0.6)
 
 
 def _read(table: Path) -> list[dict[str, float]]:
