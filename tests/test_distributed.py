@@ -117,7 +117,8 @@ def learn_from_the_fixed_rollout(out):
         agent.observe(distributed.gather(rollout.state["privileged"].flatten(0, 1)))
         got["buffers"] = torch.cat([b.flatten() for b in agent.buffers()])
         # Without minibatches no shuffling tells the joined batch from the shares.
-        whole = dataclasses.replace(config, minibatch=None, epochs=20, max_kl=1e-4)
+        epochs = {"epochs": 20, "max_kl": 1e-4, "target_kl": None}
+        whole = dataclasses.replace(config, minibatch=None, **epochs)
         optimizer = torch.optim.SGD(agent.parameters(), 0.05)
         got["figures"] = ppo.update(agent, optimizer, rollout, whole)
         got["weights"] = parameters_to_vector(agent.parameters()).detach()
