@@ -13,13 +13,15 @@ import numpy as np
 import pytest
 import sapien
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from ir_maniskill.environment import table_scene
 
 CAMERAS = 2
 PARTS = 25  # draw calls for each picture: 21 of the robot, the room, three objects
 TRIANGLES = 1_650
-PYTHON_CALLS = 125  # of Python functions in one step with pictures, 103 when written
+PYTHON_CALLS = 115  # of Python functions in one step with pictures, 99 when written
+OPERATIONS = 50  # of torch in one step with pictures, 44 when written
 SUBSTEPS = 5
 PIPE_BYTES = 200  # for one worker and one step, there and back
 
@@ -71,6 +73,18 @@ class CountingPipe:
         data = self.pipe.recv_bytes()
         self.bytes += len(data)
         return pickle.loads(data)
+
+
+class CountingMode(TorchDispatchMode):
+    """Counts the operations of torch."""
+
+    def __init__(self):
+        super().__init__()
+        self.operations = 0
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        self.operations += 1
+        return function(*args, **(kwargs or {}))
 
 
 def count_calls(monkeypatch, owner, method):
@@ -141,6 +155,14 @@ def test_a_step_calls_few_python_functions(multi_env):
     finally:
         sys.setprofile(before)
     assert calls <= PYTHON_CALLS
+
+
+@pytest.mark.render
+def test_a_step_asks_little_of_torch(multi_env):
+    multi_env.reset()
+    with CountingMode() as counter:
+        multi_env.step(np.zeros(26, dtype=np.float32))
+    assert counter.operations <= OPERATIONS
 
 
 @pytest.mark.render

@@ -44,27 +44,26 @@ class CpuContactQuery:
         fingers: Sequence[Sequence[Link]],
         objects: Sequence[Actor],
     ) -> None:
-        """Remember which body is which finger or object."""
+        """Remember which two bodies are which finger and object."""
         self._system = scene.px
-        self._finger = {
-            link._bodies[0]: f for f, links in enumerate(fingers) for link in links
-        }
-        self._object = {actor._bodies[0]: c for c, actor in enumerate(objects)}
+        self._place: dict[tuple, tuple[int, int, int]] = {}
+        for f, links in enumerate(fingers):
+            for c, actor in enumerate(objects):
+                for link in links:
+                    pair = link._bodies[0], actor._bodies[0]
+                    self._place[pair] = self._place[pair[::-1]] = (0, f, c)
         self._shape = (1, len(fingers), len(objects))
 
     def __call__(self) -> Tensor:
         """Return the forces of the last physics step [1, F, C] [N]."""
         force = np.zeros(self._shape, dtype=np.float32)
         for contact in self._system.get_contacts():
-            first, second = contact.bodies
-            f, c = self._finger.get(first), self._object.get(second)
-            if f is None or c is None:
-                f, c = self._finger.get(second), self._object.get(first)
-                if f is None or c is None:
-                    continue
-            impulse = sum(point.impulse for point in contact.points)
-            force[0, f, c] += np.linalg.norm(impulse)
-        return torch.from_numpy(force / self._system.timestep)
+            place = self._place.get(tuple(contact.bodies))
+            if place is not None:
+                impulse = sum(point.impulse for point in contact.points)
+                force[place] += np.linalg.norm(impulse)
+        force /= self._system.timestep
+        return torch.from_numpy(force)
 
 
 class GpuContactQuery:

@@ -100,6 +100,7 @@ class TouchEnv(BaseEnv):
         self.dense_weights = replace(DenseWeights(), **(dense_weights or {}))
         self._colors_only = False  # without a renderer no sensors are set up
         self._drawing = False  # whether pictures of this very state are under way
+        self._fresh = True  # whether some env was reset after the last step
         if render_backend == "auto":
             render_backend = "gpu" if torch.cuda.is_available() else "cpu"
         if render_backend not in ("none", None):
@@ -240,19 +241,22 @@ class TouchEnv(BaseEnv):
         if seed is not None and not self._sim_device.is_cuda():
             options.setdefault("reconfigure", True)
         gym.Env.reset(self, seed=seed if isinstance(seed, int) else None)
+        self._fresh = True
         return super().reset(seed, options)
 
     def step(self, action: Any) -> tuple[Any, Tensor, Tensor, Tensor, dict]:
         """Step as ManiSkill does, except that success does not end the episode."""
+        if isinstance(action, np.ndarray) and action.flags.writeable:
+            action = torch.from_numpy(action)  # ManiSkill's way takes much longer
         obs, reward, terminated, truncated, info = super().step(action)
-        return obs, reward, torch.zeros_like(terminated), truncated, info
+        return obs, reward, terminated.zero_(), truncated, info
 
     # -- What the sentence asks ------------------------------------------------------
 
     @property
     def target_index(self) -> Tensor:
         """Index in `objects` of the one that the active sentence names [N] int64."""
-        return self.instructional_set.targets[self.instruction_index]
+        return self.instructional_set.targets.index_select(0, self.instruction_index)
 
     def get_language_instruction(self) -> list[str]:
         """Return the active sentence i_t of each env (N strings)."""
@@ -270,9 +274,9 @@ class TouchEnv(BaseEnv):
             this episode), `exclusive_success` (the named object has been touched and
             no other) as bool; and `contact` [N, F, C] bool.
         """
-        # Right after a reset PhysX still holds the contacts of the last episode.
-        started = (self._elapsed_steps > 0)[:, None, None]
-        contact = (self._contact_force() > TOUCH_FORCE) & started
+        contact = self._contact_force() > TOUCH_FORCE
+        if self._fresh:  # PhysX still holds the contacts of the last episode
+            contact &= (self._elapsed_steps > 0)[:, None, None]
         count = reward_generator.count_fingers(contact, self.target_index)
         success = count.right > 0
         self._success_once = self._success_once | success
@@ -284,7 +288,7 @@ class TouchEnv(BaseEnv):
             "success": success,
             "success_once": self._success_once,
             "wrong_once": self._wrong_once,
-            "exclusive_success": self._success_once & ~self._wrong_once,
+            "exclusive_success": self._success_once > self._wrong_once,
         }
 
     # -- Observation o_t -------------------------------------------------------------
@@ -296,27 +300,46 @@ class TouchEnv(BaseEnv):
         return obs
 
     def _get_obs_extra(self, info: dict[str, Tensor]) -> dict[str, Tensor]:
+        index = self.instruction_index
         obs = {
             "touch": info["contact"].any(dim=2).float(),  # [N, F]
-            "instruction": self.instructional_set.tokens[self.instruction_index],
+            "instruction": self.instructional_set.tokens.index_select(0, index),
         }
         if self.obs_mode_struct.use_state:
-            one_hot = torch.nn.functional.one_hot(self.target_index, len(self.objects))
-            obs["object_position"] = self._object_position()  # [N, C, 3]
-            obs["finger_position"] = self.agent.finger_position()  # [N, F, 3]
-            obs["target_object"] = one_hot.float()  # [N, C]
+            obs |= self._positions()
+            named = self.instructional_set.named.index_select(0, index)
+            obs["target_object"] = named  # [N, C]
             obs["wrong_once"] = info["wrong_once"].float()[:, None]  # [N, 1]
         return obs
 
     def _flatten_raw_obs(self, obs: Any) -> Any:
-        if self.obs_mode_struct.state:  # ManiSkill flattens leaves of one row per env
-            obs["extra"] = {
-                name: leaf.flatten(1) for name, leaf in obs["extra"].items()
-            }
-        return super()._flatten_raw_obs(obs)
+        """Fetch pictures under way; flatten as ManiSkill does, but all at once."""
+        if self._drawing:
+            obs["sensor_data"] = self._get_obs_sensor_data()
+        if not self.obs_mode_struct.state:
+            return obs
+        leaves = [*obs.pop("agent").values(), *obs.pop("extra").values()]
+        flat = torch.cat([leaf.flatten(1) for leaf in leaves], dim=1)
+        return flat if self.obs_mode == "state" else obs | {"state": flat}
 
-    def _object_position(self) -> Tensor:
-        return positions(self.objects)
+    def _positions(self) -> dict[str, Tensor]:
+        return {
+            "object_position": positions(self.objects),  # [N, C, 3]
+            "finger_position": self.agent.finger_position(),  # [N, F, 3]
+        }
+
+    def _get_obs_with_sensor_data(
+        self, info: dict[str, Tensor], apply_texture_transforms: bool = True
+    ) -> dict:
+        """Observe; within a step pictures come last, in `_flatten_raw_obs`."""
+        if not self._drawing:
+            return super()._get_obs_with_sensor_data(info, apply_texture_transforms)
+        return {
+            "agent": self._get_obs_agent(),
+            "extra": self._get_obs_extra(info),
+            "sensor_param": self.get_sensor_params(),
+            "sensor_data": {},
+        }
 
     def _get_obs_sensor_data(self, apply_texture_transforms: bool = True) -> dict:
         drawing, self._drawing = self._drawing, False
@@ -328,6 +351,7 @@ class TouchEnv(BaseEnv):
         return {name: self._fetch_color(sensor) for name, sensor in sensors}
 
     def _after_control_step(self) -> None:
+        self._fresh = False
         # Software renderers draw on other cores while contacts are judged here.
         if self._colors_only:
             self._draw_pictures()
@@ -344,8 +368,11 @@ class TouchEnv(BaseEnv):
         Torch copies even small pictures on all cores, which wait for each other.
         """
         (camera,) = sensor.camera._render_cameras
-        color = torch.from_numpy(camera.get_picture("Color")[None])  # [1, H, W, 4]
-        return sensor.config.shader_config.texture_transforms["Color"](color)
+        color = camera.get_picture("Color")[None]  # [1, H, W, 4]
+        if color.dtype == np.uint8:  # NumPy cuts alpha off in less time than torch
+            return {"rgb": torch.from_numpy(color[..., :3])}
+        transform = sensor.config.shader_config.texture_transforms["Color"]
+        return transform(torch.from_numpy(color))
 
     def get_sensor_params(self) -> dict:
         """Return the cameras' matrices, computed once: no camera ever moves."""
@@ -365,9 +392,10 @@ class TouchEnv(BaseEnv):
         self, obs: Any, action: Tensor, info: dict[str, Tensor]
     ) -> Tensor:
         """Return the paper's reward with our shaping toward the named object [N]."""
+        at = obs["extra"] if self.obs_mode_struct.use_state else self._positions()
         rows = torch.arange(self.num_envs, device=self.device)
-        goal = self._object_position()[rows, self.target_index]  # [N, 3]
-        distance = (self.agent.finger_position() - goal[:, None]).norm(dim=-1)
+        goal = at["object_position"][rows, self.target_index]  # [N, 3]
+        distance = (at["finger_position"] - goal[:, None]).norm(dim=-1)
         return reward_generator.dense_reward(
             self.experiment,
             _count(info),

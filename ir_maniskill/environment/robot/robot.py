@@ -7,6 +7,7 @@ Legend: N envs, J joints, F fingers, C objects.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -89,15 +90,22 @@ class TargetController(PDJointPosController):
 
         Args:
             targets: Positions in the order of `config.joint_names` [N, J] [rad].
+
+        Raises:
+            ValueError: They hold NaN (checked on the CPU only).
         """
-        self._target_qpos = targets.clamp(self.lower, self.upper)
+        targets = targets.clamp(self.lower, self.upper)
         if self.scene.gpu_sim_enabled:
-            super().set_drive_targets(self._target_qpos)
-            return
-        for joint, angle in zip(
-            self._physx_joints, self._target_qpos[0].tolist(), strict=True
-        ):
-            joint.set_drive_target(angle)
+            super().set_drive_targets(targets)
+        else:
+            angles = targets.tolist()[0]
+            if math.isnan(sum(angles)):
+                raise ValueError(
+                    f"joint targets: got {angles}, expected no NaN: look at the action"
+                )
+            for joint, angle in zip(self._physx_joints, angles, strict=True):
+                joint.set_drive_target(angle)
+        self._target_qpos = targets
 
     def reset(self) -> None:
         """Make the current positions the targets of the envs being reset."""
@@ -220,10 +228,8 @@ class Robot(BaseAgent, ABC):
             action: As the control mode asks, in the order of `joints` [N, J].
 
         Raises:
-            ValueError: It holds NaN (checked on the CPU only).
+            ValueError: It leads to NaN (checked on the CPU only).
         """
-        if not self.scene.gpu_sim_enabled and bool(action.isnan().any()):
-            raise ValueError(f"action: got NaN, expected numbers in [-1, 1]: {action}")
         self.controller.set_action(action)
 
     def to_qpos(self, position: Tensor) -> Tensor:
@@ -251,7 +257,7 @@ class Robot(BaseAgent, ABC):
             [N, J] with the joints' limits mapped to [-1, 1].
         """
         return {
-            "proprioception": self._normalize(self.robot.get_qpos()[:, self._order]),
+            "proprioception": self._normalize(self._ordered(self.robot.get_qpos())),
             "target": self._normalize(self.controller.target),
         }
 
@@ -265,11 +271,15 @@ class Robot(BaseAgent, ABC):
 
     def joint_velocity(self) -> Tensor:
         """Return joint velocities in the action's order [N, J] [rad/s]."""
-        return self.robot.get_qvel()[:, self._order]
+        return self._ordered(self.robot.get_qvel())
 
     def finger_position(self) -> Tensor:
         """Return where the last link of each finger is [N, F, 3] [m]."""
         return positions([links[-1] for links in self.finger_links])
+
+    def _ordered(self, joints: Tensor) -> Tensor:
+        """Reorder [N, J] from the simulator's order to the action's."""
+        return joints.index_select(1, self._order)
 
     def _normalize(self, position: Tensor) -> Tensor:
         return ((position - self._middle) / self._half_range).clamp(-1, 1)
