@@ -192,6 +192,18 @@ def test_a_broken_checkpoint_is_refused(tmp_path):
         run(config, resume=True)
 
 
+@pytest.mark.parametrize("rate", [0.0, float("nan"), "fast"])
+def test_a_step_size_that_cannot_be_is_refused(tmp_path, rate):
+    config = toy_config(tmp_path, total_steps=UPDATE)
+    run(config)
+    last = tmp_path / "last.safetensors"
+    stored = checkpoint.read(last)
+    stored.metadata["learning_rate"] = rate
+    checkpoint.write(last, stored)
+    with pytest.raises(CheckpointError, match="learning_rate: got"):
+        run(config, resume=True)
+
+
 def test_a_folder_that_cannot_be_written_is_refused_before_training(tmp_path):
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(CheckpointError, match=r"cannot write to .*choose another"):

@@ -265,8 +265,9 @@ class Trainer:
             checkpoint.set_random_state(stored.tensors, stored.metadata["random"])
             self.reward_scale.load_state_dict(stored.metadata["reward_scale"])
             self.best_score = float(stored.metadata["best_score"])
+            rate = _positive(stored.metadata["learning_rate"])
             for group in self.optimizer.param_groups:
-                group["lr"] = float(stored.metadata["learning_rate"])
+                group["lr"] = rate
             self.steps = _whole_steps(stored.metadata["steps"])
         except checkpoint.MALFORMED as error:
             if isinstance(error, CheckpointError):
@@ -361,6 +362,13 @@ def _whole_steps(got: object) -> int:
     """Return the step count of a checkpoint."""
     if type(got) is not int or got < 0:
         raise ValueError(f"steps: got {got!r}, expected a whole number")
+    return got
+
+
+def _positive(got: object) -> float:
+    """Return the step size of a checkpoint."""
+    if not isinstance(got, float) or not 0 < got < math.inf:
+        raise ValueError(f"learning_rate: got {got!r}, expected a number above 0")
     return got
 
 
