@@ -4,18 +4,22 @@ For each scene it searches joint targets by the cross-entropy method, playing th
 again and again, so that as many fingers as can be are on the named object at every step
 (goal "fingers"), or the object is touched in as many steps as can be ("touching"), and
 no other object ever is. A plan is two postures, one after the other; the joint targets
-move as fast as the policies' own control mode lets them. It is no agent: it sees no
-picture, reads no sentence, and may try a scene hundreds of times. What it finds is a
-lower bound of what can be reached, by which the policies' figures can be judged.
+move as fast as the policies' own control mode lets them. Plans found before, for other
+scenes, colors and tasks, are starts for new ones: mirrored where the object lies on the
+other side, and with the fingers shifted by inverse kinematics as the object is.
 
-    python scripts/oracle.py NaoTouchCubeTriangle-v1 --scenes 10
+It is no agent: it sees no picture, reads no sentence, and may try a scene hundreds of
+times. What it finds is a lower bound of what can be reached, by which the policies'
+figures can be judged.
+
+    python scripts/oracle.py NaoTouchCubeTriangle-v1 --scenes 6
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,11 +28,18 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 import torch
+from scipy.optimize import least_squares
 from tqdm import tqdm
 
 import ir_maniskill  # noqa: F401 - registers the tasks
 from ir_maniskill import experiment as catalog
-from ir_maniskill.environment.robot.nao import ARM, FINGER_JOINTS, HAND, JOINTS
+from ir_maniskill.environment.robot.nao import (
+    ARM,
+    ARM_JOINTS,
+    FINGER_JOINTS,
+    HAND,
+    JOINTS,
+)
 from ir_maniskill.training.evaluate import versions
 
 OUT = Path(__file__).parent.parent / "docs" / "results" / "oracle.json"
@@ -39,11 +50,20 @@ DELTA = np.array([(HAND if j[1:] in FINGER_JOINTS else ARM).delta for j in JOINT
 PLAN = 2 * len(JOINTS) + 1
 """Numbers of a plan: two postures in [-1, 1], and when to change over."""
 
+SIDE = len(JOINTS) // 2
+"""Joints of one side: the first so many are the left arm's and hand's."""
 MIRROR = np.array([1, -1, -1, -1, -1] + [1] * len(FINGER_JOINTS))
 """Sign of each joint of one side on the other; pitch and fingers keep theirs."""
 
 Goal = Literal["fingers", "touching"]
 GOALS: tuple[Goal, ...] = ("fingers", "touching")
+
+ARM_INDEX = np.array([i for i, joint in enumerate(JOINTS) if joint[1:] in ARM_JOINTS])
+"""Which joints are those of the arms, not of the hands."""
+MOST_KNOWN = 6
+"""Known plans to begin with, at most: those for the nearest places."""
+MIDDLE = 0.03
+"""How far left or right of the chest both hands are used [m]; beyond, the near one."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +88,11 @@ class Outcome:
         touch = self.right if goal == "fingers" else self.right > 0
         spoiled = (1 + 8 * (self.wrong > 0).mean()) if self.wrong.any() else 0
         return float(touch.mean() + 0.5 * self.nearness - spoiled)
+
+    def promise(self, goal: Goal) -> float:
+        """Return how good it may become: what only brushes another object is near."""
+        touch = self.right if goal == "fingers" else self.right > 0
+        return float(touch.mean() + self.nearness - 2 * (self.wrong > 0).mean())
 
 
 Play = Callable[[np.ndarray], Outcome]
@@ -120,14 +145,59 @@ class Stage:
         return Outcome(right, wrong, float(np.mean(near)))
 
     def _nearness(self) -> float:
-        env = self._env
-        goal = env.objects[int(env.target_index)].pose.p  # [1, 3]
-        distance = (env.agent.finger_position()[0] - goal).norm(dim=-1)  # [F] [m]
-        return float((1 - torch.tanh(distance / 0.1)).mean())
+        distance = np.linalg.norm(self._fingers() - self.place(), axis=1)  # [F] [m]
+        return float((1 - np.tanh(distance / 0.1)).mean())
+
+    def _fingers(self) -> np.ndarray:
+        return self._env.agent.finger_position()[0].numpy().astype(float)  # [F, 3] [m]
+
+    def place(self) -> np.ndarray:
+        """Return where the named object is now [3] [m]."""
+        index = int(self._env.target_index)
+        return self._env.objects[index].pose.p[0].numpy().astype(float)
+
+    def shifted(self, plan: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        """Return the plan with all fingers moved, as far as the arms can.
+
+        Args:
+            plan: What to change; its fingers keep their angles.
+            offset: How far [3] [m].
+        """
+        postures = [
+            self._reach(posture, self._fingers_at(posture) + offset)
+            for posture in plan[:-1].clip(-1, 1).reshape(2, len(JOINTS))
+        ]
+        return np.append(postures, plan[-1])
+
+    def _reach(self, posture: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """Return the posture with the arms changed so that the fingers are there."""
+
+        def misses(arms: np.ndarray) -> np.ndarray:
+            miss = self._fingers_at(_with_arms(posture, arms)) - goal
+            # Of postures about as good it is the nearest that is wanted.
+            return np.append(miss.ravel(), 0.01 * (arms - start))
+
+        start = posture[ARM_INDEX].clip(-0.999, 0.999)
+        arms = least_squares(misses, start, bounds=(-1, 1), diff_step=1e-3).x
+        return _with_arms(posture, arms)
+
+    def _fingers_at(self, posture: np.ndarray) -> np.ndarray:
+        """Return where the fingers would be [F, 3] [m]; moves the robot there."""
+        robot, drive = self._env.agent, self._env.agent.controller
+        share = torch.from_numpy((posture + 1) / 2).float()
+        angles = drive.lower + share * (drive.upper - drive.lower)  # [J] [rad]
+        robot.robot.set_qpos(robot.to_qpos(angles)[None])
+        return self._fingers()
 
     def close(self) -> None:
         """Free the simulator."""
         self._env.close()
+
+
+def _with_arms(posture: np.ndarray, arms: np.ndarray) -> np.ndarray:
+    changed = posture.copy()
+    changed[ARM_INDEX] = arms
+    return changed
 
 
 @dataclass(frozen=True)
@@ -140,38 +210,47 @@ class Effort:
     """Plans of a population."""
     spread: float
     """Standard deviation of the first population [half a joint's range]."""
-    patience: int = 1_000
+    patience: int
     """Populations without progress after which to give up."""
 
 
-FROM_NOTHING = Effort(rounds=30, size=96, spread=0.4)
-"""For the first scene of a sentence, if no known plan touches its object alone."""
-ADAPT = Effort(rounds=12, size=32, spread=0.12, patience=5)
-"""For the first scene if one does, and for others where none does."""
-REFINE = Effort(rounds=4, size=16, spread=0.05, patience=2)
-"""For other scenes, from the plans for those before."""
-EFFORTS = (FROM_NOTHING, ADAPT, REFINE)
+@dataclass(frozen=True)
+class Efforts:
+    """How hard to search, depending on what is known."""
+
+    wide: Effort = Effort(rounds=30, size=64, spread=0.4, patience=10)
+    """Where no known plan touches the object."""
+    first: Effort = Effort(rounds=15, size=32, spread=0.15, patience=2)
+    """Where one does: from the best of them, on the first scene of a sentence."""
+    near: Effort = Effort(rounds=10, size=12, spread=0.08, patience=2)
+    """The same on other scenes."""
 
 
 def search(
     play: Play,
     known: list[np.ndarray],
     goal: Goal,
-    effort: Effort,
+    efforts: tuple[Effort, Effort],
     rng: np.random.Generator,
+    free: np.ndarray | float = 1.0,
 ) -> np.ndarray:
     """Return the best plan found by the cross-entropy method.
 
     Args:
         play: Tries a plan.
-        known: Plans to begin with; the search spreads around the best of them.
+        known: Plans to begin with; the search spreads around the most promising.
         goal: What is good.
-        effort: How hard to search.
+        efforts: How hard to search if none of them touches the object, and if one does.
         rng: Where chance comes from.
+        free: Which numbers of the plan to change [PLAN] in {0, 1}.
     """
-    scores = [play(plan).score(goal) for plan in known]
+    outcomes = [play(plan) for plan in known]
+    scores = [outcome.score(goal) for outcome in outcomes]
+    promises = [outcome.promise(goal) for outcome in outcomes]
     best, top = known[int(np.argmax(scores))], max(scores)
-    mean, spread = best, np.full(PLAN, effort.spread)
+    mean = known[int(np.argmax(promises))]
+    effort = efforts[any(outcome.right.any() for outcome in outcomes)]
+    spread = effort.spread * free
     keep, stalled = max(4, effort.size // 8), 0
     for _ in range(effort.rounds):
         plans = mean + spread * rng.standard_normal((effort.size, PLAN))
@@ -183,28 +262,94 @@ def search(
         # The best one so far stays among the elite, whatever the others do.
         elite = np.vstack([plans[order[:keep]], best])
         mean = 0.3 * mean + 0.7 * elite.mean(0)
-        spread = 0.3 * spread + 0.7 * elite.std(0).clip(0.02)
+        spread = (0.3 * spread + 0.7 * elite.std(0)).clip(0.02) * free
         if stalled >= effort.patience:
             break
     return best
 
 
+@dataclass(frozen=True)
+class Known:
+    """A plan that was good somewhere."""
+
+    plan: np.ndarray
+    """[PLAN]."""
+    place: np.ndarray
+    """Where the object lay [3] [m]."""
+
+    def mirrored(self) -> Known:
+        """Return the same with left and right exchanged."""
+        return Known(mirror(self.plan), self.place * [1, -1, 1])
+
+
 def mirror(plan: np.ndarray) -> np.ndarray:
     """Return the plan with left and right exchanged."""
-    postures = plan[:-1].reshape(2, 2, -1)[:, ::-1] * MIRROR  # [2, sides, joints]
+    postures = plan[:-1].reshape(2, 2, SIDE)[:, ::-1] * MIRROR  # [2, sides, joints]
     return np.append(postures, plan[-1])
 
 
+def hands(place: np.ndarray) -> np.ndarray:
+    """Return which numbers of a plan move the hands that reach a place [PLAN]."""
+    left, right = place[1] > -MIDDLE, place[1] < MIDDLE
+    joints = np.repeat([left, right], SIDE)
+    return np.concatenate([joints, joints, [True]])
+
+
+def starts(
+    stage: Stage, known: list[Known], place: np.ndarray, still: np.ndarray
+) -> list[np.ndarray]:
+    """Return plans to begin with: the known ones, made to fit the scene.
+
+    Args:
+        stage: Whose robot tells where fingers would be.
+        known: Plans for other scenes.
+        place: Where the object lies [3] [m].
+        still: The plan that stays at the start; a hand that cannot help does.
+    """
+    fits = [one.mirrored() if one.place[1] * place[1] < 0 else one for one in known]
+    fits.sort(key=lambda fit: float(np.linalg.norm(fit.place - place)))
+    plans = [still]
+    for fit in fits[:MOST_KNOWN]:
+        shifted = stage.shifted(fit.plan, place - fit.place)
+        plans += [np.where(hands(place), plan, still) for plan in (fit.plan, shifted)]
+    return plans
+
+
 @dataclass(frozen=True)
-class Found:
+class Found(Known):
     """The best plan of a scene and what it does there."""
 
     seed: int
     """Of the scene."""
-    plan: np.ndarray
-    """[PLAN]."""
     outcome: Outcome
     """In a scene built anew, as evaluations build it."""
+
+
+def solve(
+    stage: Stage,
+    instruction: int,
+    seed: int,
+    goal: Goal,
+    known: list[Known],
+    efforts: tuple[Effort, Effort],
+) -> Found:
+    """Return the best plan found for a scene.
+
+    Args:
+        stage: The task.
+        instruction: Index of the sentence.
+        seed: Of the scene.
+        goal: What is good.
+        known: Plans for this or other scenes.
+        efforts: As for `search`.
+    """
+    target = stage.start(seed, instruction, rebuild=True)
+    place, still = stage.place(), np.append([target, target], 0.0)
+    plans = starts(stage, known, place, still)
+    play = partial(stage.play, seed=seed, instruction=instruction)
+    rng = np.random.default_rng(seed)
+    plan = search(play, plans, goal, efforts, rng, hands(place))
+    return Found(plan, place, seed, play(plan, rebuild=True))
 
 
 def explore(
@@ -212,8 +357,8 @@ def explore(
     instruction: int,
     seeds: list[int],
     goal: Goal,
-    known: list[np.ndarray],
-    efforts: tuple[Effort, Effort, Effort] = EFFORTS,
+    known: list[Known],
+    efforts: Efforts = Efforts(),
 ) -> list[Found]:
     """Return the best plans found for the scenes.
 
@@ -222,27 +367,32 @@ def explore(
         instruction: Index of the sentence.
         seeds: Of the scenes.
         goal: What is good.
-        known: Plans to begin with, beside staying at the start.
-        efforts: As `EFFORTS`.
+        known: Plans to begin with.
+        efforts: How hard to search.
     """
-    rng = np.random.default_rng(seeds[0])
-    still = stage.start(seeds[0], instruction, rebuild=True)
-    known = [np.append([still, still], 0.0), *known]
     found: list[Found] = []
     for seed in tqdm(seeds, f"instruction {instruction}, {goal}"):
-        play = partial(stage.play, seed=seed, instruction=instruction)
-        touched = any(play(plan).exclusive for plan in known)
-        effort = efforts[touched + bool(found)]
-        plan = search(play, known, goal, effort, rng)
-        found.append(Found(seed, plan, play(plan, rebuild=True)))
-        known = [one.plan for one in found[-4:]]
+        before = best_of(found, goal)[:3] or known
+        effort = efforts.wide, efforts.near if found else efforts.first
+        found.append(solve(stage, instruction, seed, goal, before, effort))
+    # What was found for later scenes may be better for earlier ones.
+    best, effort = best_of(found, goal)[:2], (efforts.near, efforts.near)
+    for index, one in enumerate(found):
+        if one.outcome.score(goal) < best[-1].outcome.score(goal) - 0.1:
+            again = solve(stage, instruction, one.seed, goal, [one, *best], effort)
+            found[index] = best_of([one, again], goal)[0]
     return found
+
+
+def best_of(found: list[Found], goal: Goal) -> list[Found]:
+    """Return them in the order of how good they are, the best first."""
+    return sorted(found, key=lambda one: one.outcome.score(goal), reverse=True)
 
 
 def summary(found: list[Found], goal: Goal) -> dict[str, Any]:
     """Return the means over scenes, named like an evaluation's figures."""
     right = np.array([one.outcome.right for one in found])  # [scenes, T]
-    best = max(found, key=lambda one: one.outcome.score(goal))
+    best = best_of(found, goal)[0]
     return {
         "episodes": len(found),
         "exclusive": float(np.mean([one.outcome.exclusive for one in found])),
@@ -251,30 +401,33 @@ def summary(found: list[Found], goal: Goal) -> dict[str, Any]:
         "most_fingers": float(right.max(axis=1).mean()),
         "first_touch": float((right > 0).argmax(axis=1).mean() + 1),
         "plan": best.plan.round(3).tolist(),
+        "plan_place": best.place.round(4).tolist(),
         "plan_seed": best.seed,
     }
 
 
-def plans_of(data: Any) -> list[np.ndarray]:
-    """Return all plans in a file of figures, as they are and mirrored."""
-    plans = [
-        np.array(figures["plan"])
+def plans_of(data: Any) -> list[Known]:
+    """Return all plans in a file of figures."""
+    return [
+        Known(np.array(figures["plan"]), np.array(figures["plan_place"]))
         for task in data.values()
         for goals in task["instructions"].values()
         for figures in goals.values()
     ]
-    return [*plans, *map(mirror, plans)]
 
 
 def measure(
-    env_id: str, scenes: int, known: list[np.ndarray]
-) -> dict[str, dict[Goal, dict[str, Any]]]:
-    """Return the figures of each sentence and goal on the scenes of the evaluation.
+    env_id: str, scenes: int, known: list[Known]
+) -> Iterator[dict[str, dict[Goal, dict[str, Any]]]]:
+    """Yield the figures of each sentence and goal on the scenes of the evaluation.
 
     Args:
         env_id: The task.
         scenes: How many for each sentence.
         known: Plans to begin with.
+
+    Yields:
+        The figures so far, after every sentence.
     """
     sentences = catalog.get(env_id).sentences
     stage, count = Stage(env_id), len(sentences)
@@ -285,12 +438,10 @@ def measure(
         for goal in GOALS:
             found = explore(stage, index, seeds, goal, known)
             figures[sentence][goal] = summary(found, goal)
-            # What holds an object with many fingers also touches it soon, and the
-            # scenes are nearly symmetric.
-            plans = [one.plan for one in found[-2:]]
-            known = [*known, *plans, *map(mirror, plans)]
+            # What holds an object with many fingers also touches it soon.
+            known = [*best_of(found, goal)[:3], *known]
+        yield figures
     stage.close()
-    return figures
 
 
 def main() -> None:
@@ -309,10 +460,10 @@ def main() -> None:
     data = json.loads(given.out.read_text()) if given.out.exists() else {}
     for task in given.tasks:
         known = [] if given.anew else plans_of(data)
-        figures = measure(task, given.scenes, known)
-        data[task] = {"seed": SEED, "versions": versions(), "instructions": figures}
-        given.out.parent.mkdir(parents=True, exist_ok=True)
-        given.out.write_text(json.dumps(data, indent=1) + "\n")
+        for figures in measure(task, given.scenes, known):
+            data[task] = {"seed": SEED, "versions": versions(), "instructions": figures}
+            given.out.parent.mkdir(parents=True, exist_ok=True)
+            given.out.write_text(json.dumps(data, indent=1) + "\n")
 
 
 if __name__ == "__main__":
