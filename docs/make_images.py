@@ -1,17 +1,25 @@
-"""Renders the pictures of the README from the project's own tasks.
+"""Renders the README's pictures and films from the project's own tasks and policies.
 
-python docs/make_images.py
+python docs/make_images.py                           # all
+python docs/make_images.py nao NaoTouchCubeMulti-v1  # these
 """
 
+import argparse
+from collections.abc import Callable
+from functools import partial
+from importlib.resources import files
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 from mani_skill.utils.sapien_utils import look_at
 from PIL import Image, ImageDraw, ImageFont
 
 import ir_maniskill  # noqa: F401 - registers the tasks
+from ir_maniskill import experiment as catalog
+from ir_maniskill.training.checkpoint import load_policy
+from ir_maniskill.training.video import record, write_video
 
 FOLDER = Path(__file__).parent / "images"
 PAGE, INK, FAINT = (18, 20, 24), (238, 240, 244), (150, 156, 168)
@@ -19,6 +27,16 @@ GAP = 16
 """Between pictures [pixel]."""
 CLOSE = ((0.74, 0.34, 0.40), (0.06, 0.0, 0.08))
 """Eye and target of the pictures of the scenes [m]."""
+FILMS = (
+    "NaoTouchCubeSingle-v1",
+    "NaoTouchCubeMulti-v1",
+    "NaoTouchCubeTriangle-v1",
+    "NaoTouchCubeShuffled-v1",
+    "NaoTouchButtonShuffled-v1",
+)
+"""The tasks of which there is a film."""
+SCENE = 2_000_000
+"""Seed of the films' scenes: the first of an evaluation."""
 
 
 def shoot(task: str, size: tuple[int, int]) -> tuple[Image.Image, list[Image.Image]]:
@@ -83,14 +101,42 @@ def scenes() -> Image.Image:
     return page
 
 
+def save(make: Callable[[], Image.Image], path: Path) -> None:
+    """Writes a picture, small."""
+    page = make().quantize(256, dither=Image.Dither.FLOYDSTEINBERG)
+    page.save(path, optimize=True)
+
+
+def film(task: str, path: Path) -> None:
+    """Writes a film of the shipped policy, told every sentence in the same scene."""
+    folder = Path(str(files("ir_maniskill.assets") / "policies"))
+    agent, config, _ = load_policy(folder / f"{task}.safetensors")
+    play = partial(
+        *(record, agent.policy, task),
+        episodes=1,
+        seed=SCENE,
+        frames=config.frames,
+        env_kwargs=config.env_kwargs(training=False),
+    )
+    told = range(len(catalog.get(task).sentences))
+    write_video(path, chain.from_iterable(play(instructions=[i]) for i in told))
+
+
 def main() -> None:
-    """Writes all pictures."""
-    FOLDER.mkdir(exist_ok=True)
-    for name, page in (("nao.png", hero()), ("tasks.png", scenes())):
-        page.quantize(256, dither=Image.Dither.FLOYDSTEINBERG).save(
-            FOLDER / name, optimize=True
-        )
-        print(name, np.asarray(page).shape)
+    """Writes what is asked for."""
+    pictures = {"nao": partial(save, hero), "tasks": partial(save, scenes)}
+    films = {task: partial(film, task) for task in FILMS}
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser.add_argument("names", nargs="*", help=f"of {', '.join(pictures | films)}")
+    parser.add_argument("--folder", type=Path, default=FOLDER)
+    given = parser.parse_args()
+    if unknown := set(given.names) - set(pictures | films):
+        parser.error(f"got {', '.join(unknown)}, expected some of the names")
+    given.folder.mkdir(exist_ok=True, parents=True)
+    for name in given.names or pictures | films:
+        path = given.folder / f"{name}.{'png' if name in pictures else 'gif'}"
+        (pictures | films)[name](path)
+        print(path, f"{path.stat().st_size / 1e6:.2f} MB")
 
 
 if __name__ == "__main__":

@@ -34,6 +34,7 @@ Pictures = dict[str, dict[str, list["Group"]]]
 ROOT = Path(__file__).parent.parent
 FOLDER = ROOT / "docs" / "results"
 POLICIES = ROOT / "assets" / "policies"
+IMAGES = ROOT / "docs" / "images"
 PAGES = (FOLDER / "README.md", ROOT / "README.md")
 """Whose marked sections are written here."""
 
@@ -535,6 +536,17 @@ def draw(wanted: Pictures, folder: Path) -> None:
         compare(curves, folder / f"{name}.png", level=PAPER.get(groups[0].task))
 
 
+def films(folder: Path = IMAGES) -> str:
+    """Return the films of shipped policies that there are, two in a row."""
+    cells = [
+        f'`{task}`<br><img src="docs/images/{task}.gif" width="400" alt="{task}">'
+        for task in tasks()
+        if (folder / f"{task}.gif").is_file()
+    ]
+    rows = [cells[first : first + 2] for first in range(0, len(cells), 2)]
+    return table(("", ""), [[*row, ""][:2] for row in rows])
+
+
 def sections(folder: Path = FOLDER, policies: Path = POLICIES) -> dict[str, str]:
     """Return the text of each marked section of the pages."""
     groups, shipped = grouped(kept(folder)), shipped_figures(policies)
@@ -549,6 +561,7 @@ def sections(folder: Path = FOLDER, policies: Path = POLICIES) -> dict[str, str]
     }
     return {
         "headline": headline_table(chosen(groups, shipped).values()),
+        "films": films(),
         "shipped": shipped_table(shipped),
         "scenes": scenes_table(shipped),
         "limit": limit_table(oracle, shipped),

@@ -185,6 +185,15 @@ def test_the_policy_is_compared_with_the_limit_of_its_sentence():
     assert cells[8:] == ["80.0%", "80.0%", "1.00 |"]
 
 
+def test_the_films_that_there_are_stand_two_in_a_row(tmp_path):
+    for task in ("NaoTouchCubeMulti-v1", "NaoTouchCubeShuffled-v1", TRIANGLE):
+        (tmp_path / f"{task}.gif").touch()
+    text = results.films(tmp_path)
+    assert "Multi" in cells(text)[0] and TRIANGLE in cells(text)[1]
+    assert "Shuffled" in cells(text, 1)[0] and cells(text, 1)[1] == ""
+    assert results.films(tmp_path / "none") == results.NOTHING
+
+
 def test_only_what_stands_between_markers_is_written():
     page = "a\n<!-- begin x -->\nold\n<!-- end x -->\nb"
     new = results.fill(page, {"x": r"\1 new", "y": ""})

@@ -127,6 +127,7 @@ def compare(curves: Sequence[Curve], out: Path, level: float | None = None) -> P
     shares.set_ylabel("Exclusive success [%]")
     fingers.set_ylim(bottom=0)
     fingers.set_ylabel("Right fingers a step")
+    fingers.set_xlim(left=0)
     fingers.set_xlabel("Environment steps")
     figure.legend(
         *shares.get_legend_handles_labels(),
