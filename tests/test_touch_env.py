@@ -290,10 +290,11 @@ def test_touching_the_table_is_nothing(fixed: gym.Env) -> None:
 
 def test_a_reset_forgets_the_touches_of_the_last_episode(fixed: gym.Env) -> None:
     fixed.reset(seed=0, options={"instruction": RED})
-    hold(fixed, **PRESS)
+    *_, last = hold(fixed, **PRESS)
     obs, info = fixed.reset()
     assert not obs["extra"]["touch"].any()
     assert not info["success_once"].any()
+    assert last["success_once"].all()  # what was told of it stays
 
 
 def test_dense_reward_grows_as_the_hand_comes_near() -> None:

@@ -183,8 +183,9 @@ class TouchEnv(BaseEnv):
         jitter = self._tensor(2 * joint - 1) * self.experiment.jitter.joints
         qpos = self.agent.clamp_qpos(self.agent.start_qpos + jitter)
         self.agent.robot.set_qpos(qpos)
-        self._success_once[env_idx] = False
-        self._wrong_once[env_idx] = False
+        # The last step's info, which others may keep, holds these very tensors.
+        self._success_once = self._success_once.index_fill(0, env_idx, False)
+        self._wrong_once = self._wrong_once.index_fill(0, env_idx, False)
         self._drawing = False
 
     def _choose_instruction(
@@ -440,6 +441,8 @@ class TouchEnv(BaseEnv):
         if "task" in state:
             task = {name: state["task"][name][..., 0] for name in TASK_STATE}
             self.instruction_index[rows] = task["instruction_index"].long()
+            self._success_once = self._success_once.clone()
+            self._wrong_once = self._wrong_once.clone()
             self._success_once[rows] = task["success_once"].bool()
             self._wrong_once[rows] = task["wrong_once"].bool()
 
