@@ -32,7 +32,7 @@ FILMS = (
     "NaoTouchCubeMulti-v1",
     "NaoTouchCubeTriangle-v1",
     "NaoTouchCubeShuffled-v1",
-    "NaoTouchButtonShuffled-v1",
+    "NaoTouchButtonMulti-v1",
 )
 """The tasks of which there is a film."""
 SCENE = 2_000_000
