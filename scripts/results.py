@@ -135,6 +135,9 @@ def take_in(folder: Path) -> Run:
     metrics, evaluations = map(_rows, tables)
     name = folder.resolve().name
     config = json.loads((folder / "config.json").read_text())
+    figures = json.loads(report.read_text())
+    for told_above in ("config", "checkpoint"):  # with paths of the machine
+        figures.pop(told_above, None)
     seconds = sum(row["time/collect"] + row["time/update"] for row in metrics)
     return Run(
         name=name,
@@ -142,7 +145,7 @@ def take_in(folder: Path) -> Run:
         steps=int(metrics[-1]["steps"]),
         minutes=round(seconds / 60, 1),
         evaluations=evaluations,
-        report=json.loads(report.read_text()),
+        report=figures,
     )
 
 
