@@ -350,8 +350,7 @@ def headline_table(groups: Iterable[Group]) -> str:
             *(f"`{group.task}`", *group.effort),
             group.episodes,
             *(_lowest(group.scores, name) for name in ("success", "exclusive")),
-            _worst(group.scores, "touching"),
-            f"{min(score['right_fingers'] for score in group.scores):.2f}",
+            *_reached(group)[2:],
         )
         for group in groups
     ]
