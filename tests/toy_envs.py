@@ -35,7 +35,6 @@ class ToyVectorEnv:
         self.touched = torch.zeros(num_envs, dtype=torch.bool)
         self.streams = [np.random.default_rng(i) for i in range(num_envs)]
 
-    @torch.inference_mode(False)
     def reset(self, *, seed=None, options=None):
         if seed is not None:
             rows = range(self.num_envs)
@@ -45,7 +44,6 @@ class ToyVectorEnv:
             self.told[:] = options["instruction"]
         return self._observe(), {}
 
-    @torch.inference_mode(False)
     def step(self, action):
         assert action.abs().max() <= 1, "actions must arrive clipped"
         self.joints = (self.joints + 0.3 * action).clamp(-1, 1)

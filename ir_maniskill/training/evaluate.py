@@ -388,7 +388,7 @@ def _choose_instructions(
     return chosen
 
 
-@torch.inference_mode()
+@torch.no_grad()  # envs may keep what they get, and write to it later
 def _play(
     policy: Policy,
     envs: VectorEnv,
