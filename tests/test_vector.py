@@ -11,6 +11,7 @@ import time
 import types
 from collections.abc import Iterator
 from multiprocessing.connection import wait
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -19,7 +20,7 @@ import torch
 
 import ir_maniskill
 from ir_maniskill import experiment as catalog
-from ir_maniskill.environment import process_vector
+from ir_maniskill.environment import process_vector, vector
 from ir_maniskill.environment.process_vector import ProcessVectorEnv, WorkerError
 from ir_maniskill.environment.vector import make_vec
 
@@ -33,6 +34,22 @@ def envs() -> Iterator[ProcessVectorEnv]:
     envs = make_vec(TASK, 3, num_workers=2, sim_backend="physx_cpu", **KWARGS)
     yield envs
     envs.close()
+
+
+@pytest.fixture(scope="module")
+def flat() -> Iterator[ProcessVectorEnv]:
+    """Three envs in two processes, each observation one tensor."""
+    kwargs = {**KWARGS, "obs_mode": "state"}
+    envs = make_vec(TASK, 3, num_workers=2, sim_backend="physx_cpu", **kwargs)
+    yield envs
+    envs.close()
+
+
+def arrays(tree: Any) -> Any:
+    """Return a tree of tensors as arrays."""
+    if isinstance(tree, torch.Tensor):
+        return tree.numpy()
+    return {name: arrays(branch) for name, branch in tree.items()}
 
 
 def actions(steps: int, num_envs: int) -> torch.Tensor:
@@ -60,8 +77,26 @@ def test_env_i_is_a_single_env_seeded_with_seed_plus_i(envs: ProcessVectorEnv) -
 def test_observations_are_in_the_declared_space(envs: ProcessVectorEnv) -> None:
     obs, _ = envs.reset(seed=0)
     assert obs["extra"]["object_position"].shape == (3, 3, 3)
-    arrays = {p: {k: v.numpy() for k, v in obs[p].items()} for p in obs}
-    assert envs.observation_space.contains(arrays)
+    assert envs.observation_space.contains(arrays(obs))
+
+
+def test_without_a_seed_every_env_has_a_stream_of_its_own(
+    flat: ProcessVectorEnv,
+) -> None:
+    first, second = flat.reset()[0], flat.reset()[0]
+    starts = torch.cat([first, second])
+    assert len(starts.unique(dim=0)) == 6
+    assert torch.equal(flat.reset(seed=2022)[0], first)
+    assert torch.equal(flat.reset()[0], second)
+
+
+def test_flat_observations_are_one_tensor(flat: ProcessVectorEnv) -> None:
+    assert flat.observation_space.contains(flat.reset(seed=0)[0].numpy())
+    for action in actions(32, 3):
+        obs, *_, info = flat.step(action)
+    final = info["final_observation"]
+    assert final.shape == obs.shape == flat.observation_space.shape
+    assert not torch.equal(final, obs)
 
 
 def test_an_episode_ends_in_the_same_step_it_is_reset(envs: ProcessVectorEnv) -> None:
@@ -127,6 +162,14 @@ def test_users_own_experiments_reach_the_workers() -> None:
     ends = [envs.step(action)[3].item() for action in actions(4, 1)]
     assert ends == [False, False, False, True]
     envs.close()
+
+
+def test_workers_know_what_the_environment_says_now(
+    envs: ProcessVectorEnv, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("IR_MANISKILL_NAO_URDF", "/no/such.urdf")
+    with pytest.raises(WorkerError, match=r"/no/such\.urdf: no such file"):
+        make_vec(TASK, 1, sim_backend="physx_cpu", **KWARGS)
 
 
 def test_a_failing_worker_says_why() -> None:
@@ -218,6 +261,33 @@ def test_workers_end_when_the_parent_is_killed() -> None:
     assert not any(map(alive, workers))
 
 
+def test_a_batch_on_a_gpu_is_seeded_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    resets: list[tuple] = []
+
+    def reset(seed: list[int] | None, options: dict | None) -> tuple[dict, dict]:
+        resets.append((seed, options))
+        return {}, {}
+
+    class Batch(types.SimpleNamespace):
+        """Stands in for ManiSkill's env: it needs a GPU."""
+
+        get_wrapper_attr = types.SimpleNamespace.__getattribute__
+
+    base = types.SimpleNamespace(num_envs=3, experiment=None, device="cpu")
+    spaces = ("observation_space", "action_space")
+    made = dict.fromkeys([*spaces, *(f"single_{name}" for name in spaces)])
+    batch = Batch(unwrapped=base, spec=None, metadata={}, reset=reset, **made)
+    monkeypatch.setattr(vector.gym, "make", lambda *_, **__: batch)
+    envs = make_vec(TASK, 3, sim_backend="physx_cuda")
+    some = {"env_idx": torch.tensor([1])}
+    envs.reset(seed=7)
+    envs.reset(seed=[5, 3, 4])
+    envs.reset(options=some)
+    assert resets == [([7, 8, 9], None), ([5, 3, 4], None), (None, some)]
+    with pytest.raises(ValueError, match="seed: got 7 for some of the envs"):
+        envs.reset(seed=7, options=some)
+
+
 def test_pictures_cross_the_process_border(multi_vec: ProcessVectorEnv) -> None:
     obs, _ = multi_vec.reset(seed=0)
     obs = multi_vec.step(np.zeros((2, 26), np.float32))[0]
@@ -226,3 +296,5 @@ def test_pictures_cross_the_process_border(multi_vec: ProcessVectorEnv) -> None:
         assert picture.shape == (2, 64, 32, 3)
         assert picture.dtype == torch.uint8
         assert picture.float().std() > 10
+    assert "sensor_param" in obs
+    assert multi_vec.observation_space.contains(arrays(obs))

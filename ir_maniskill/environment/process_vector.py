@@ -31,8 +31,14 @@ from ir_maniskill.experiment import Experiment
 Tree = dict[str, Any]
 """Nested dicts with tensors or arrays as leaves."""
 
-Step = tuple[Tree, Tensor, Tensor, Tensor, Tree]
+Observation = Any
+"""A tree, or in obs_mode "state" one tensor: what a single env gives."""
+
+Step = tuple[Observation, Tensor, Tensor, Tensor, Tree]
 """Observation, reward [N], terminated [N], truncated [N], info."""
+
+FIRST_SEED = 2022
+"""Seed of the first reset if it has none, as of ManiSkill's own envs."""
 
 
 class WorkerError(RuntimeError):
@@ -89,8 +95,10 @@ class _SharedTree:
         for path, value in _walk(tree):
             self.arrays[path][row] = value[0]
 
-    def read(self, *prefix: str) -> Tree:
-        """Return copies, as nested tensors, of all below `prefix`."""
+    def read(self, *prefix: str) -> Any:
+        """Return copies of the leaf at `prefix`, or, nested, of all below it."""
+        if prefix in self.arrays:
+            return torch.from_numpy(self.arrays[prefix].copy())
         tree: Tree = {}
         for path, array in self.arrays.items():
             if path[: len(prefix)] == prefix:
@@ -155,9 +163,11 @@ class ProcessVectorEnv(VectorEnv):
         cores = len(os.sched_getaffinity(0))
         workers = min(num_envs, num_workers or cores)
         self.experiment, self.num_envs, self._timeout = experiment, num_envs, timeout
-        self._rows = [list(r) for r in np.array_split(np.arange(num_envs), workers)]
+        self._rows = [r.tolist() for r in np.array_split(np.arange(num_envs), workers)]
         self._pipes: list[Connection] = []
         self._processes: list[mp.process.BaseProcess] = []
+        self._seeded = False
+        """Whether the envs' random streams have been told apart."""
         self._busy = False
         """Whether answers to a command are still to come."""
         try:
@@ -175,7 +185,7 @@ class ProcessVectorEnv(VectorEnv):
             ours, theirs = context.Pipe()
             process = context.Process(
                 target=_work,
-                args=(theirs, self.experiment, [int(r) for r in rows], env_kwargs),
+                args=(theirs, self.experiment, rows, env_kwargs, dict(os.environ)),
                 name=f"ir-maniskill-worker-{index}",
                 daemon=True,
             )
@@ -202,14 +212,21 @@ class ProcessVectorEnv(VectorEnv):
         *,
         seed: int | list[int] | None = None,
         options: dict[str, Any] | None = None,
-    ) -> tuple[Tree, Tree]:
+    ) -> tuple[Observation, Tree]:
         """Start a new episode in every env.
 
         Args:
             seed: Env i gets seed + i, or the i-th of a list; None goes on with each
-                env's own random stream.
+                env's own random stream, which begins with 2022 + i.
             options: Passed to the envs; a tensor of N values is dealt out, one each.
+
+        Raises:
+            ValueError: The list has not N seeds.
+            WorkerError: A worker refused an option, failed, died or hangs; or it has
+                not answered the last command.
         """
+        if seed is None and not self._seeded:
+            seed = FIRST_SEED
         if isinstance(seed, int):
             seed = list(range(seed, seed + self.num_envs))
         seeds = seed if seed is not None else [None] * self.num_envs
@@ -219,6 +236,7 @@ class ProcessVectorEnv(VectorEnv):
         self._command(
             "reset", [[(seeds[r], each[r]) for r in rows] for rows in self._rows]
         )
+        self._seeded = True
         return self._shared.read("obs"), self._shared.read("info")
 
     def step(self, actions: Tensor | np.ndarray) -> Step:
@@ -229,12 +247,25 @@ class ProcessVectorEnv(VectorEnv):
 
         Returns:
             Observation, reward [N], terminated [N], truncated [N] and info.
+
+        Raises:
+            ValueError: The actions have another shape or are not finite.
+            WorkerError: A worker failed, died or hangs, or has not answered the last
+                command.
         """
         self.step_async(actions)
         return self.step_wait()
 
     def step_async(self, actions: Tensor | np.ndarray) -> None:
-        """Send the actions and return at once; `step_wait` must follow."""
+        """Send the actions and return at once; `step_wait` must follow.
+
+        Args:
+            actions: One row per env [N, J] in [-1, 1].
+
+        Raises:
+            ValueError: The actions have another shape or are not finite.
+            WorkerError: A worker died, or has not answered the last command.
+        """
         actions = np.asarray(actions, dtype=np.float32)
         expected = self.action_space.shape
         if actions.shape != expected:
@@ -246,7 +277,11 @@ class ProcessVectorEnv(VectorEnv):
         self._send("step", [None] * len(self._pipes))
 
     def step_wait(self) -> Step:
-        """Wait for all workers and return what `step` returns."""
+        """Wait for all workers and return what `step` returns.
+
+        Raises:
+            WorkerError: `step_async` was not called, or a worker failed, died or hangs.
+        """
         if not self._busy:
             raise WorkerError("there is nothing to wait for: `step_async` comes first")
         self._gather()
@@ -375,12 +410,14 @@ class _Worker:
         """Return a one-row sample of all that is shared, and the spaces."""
         env = self._envs[0]
         obs, info = env.reset(seed=0)
-        action = env.action_space.sample()[None]
-        sample = _record(obs, info)
-        one = {"terminated": np.zeros(1, bool), "truncated": np.zeros(1, bool)}
-        sample["now"] = {"reward": np.zeros(1, np.float32), **one}
-        sample["final"] = _record(obs, info)
-        sample["action"] = action
+        ends = {"terminated": np.zeros(1, bool), "truncated": np.zeros(1, bool)}
+        record = {"obs": obs, "info": info}
+        sample = {
+            **record,
+            "now": {"reward": np.zeros(1, np.float32), **ends},
+            "final": record,
+            "action": env.action_space.sample()[None],
+        }
         space = env.unwrapped.single_observation_space
         return sample, space, env.unwrapped.single_action_space
 
@@ -395,7 +432,7 @@ class _Worker:
 
     def _reset(self, index: int, seed: int | None, options: dict | None) -> None:
         obs, info = self._envs[index].reset(seed=seed, options=options)
-        self._shared.write(self._rows[index], _record(obs, info))
+        self._shared.write(self._rows[index], {"obs": obs, "info": info})
 
     def step(self, _: None) -> None:
         """Step every env, and reset it if its episode is over."""
@@ -403,7 +440,7 @@ class _Worker:
         for index, (row, env) in enumerate(zip(self._rows, self._envs, strict=True)):
             obs, reward, terminated, truncated, info = env.step(actions[row])
             now = {"reward": reward, "terminated": terminated, "truncated": truncated}
-            record = _record(obs, info)
+            record = {"obs": obs, "info": info}
             self._shared.write(row, {"now": now})
             if terminated or truncated:
                 self._shared.write(row, {"final": record})
@@ -412,15 +449,17 @@ class _Worker:
                 self._shared.write(row, record)
 
 
-def _record(obs: Tree, info: Tree) -> Tree:
-    """Return what is shared of an observation and info: the cameras do not move."""
-    return {"obs": {k: v for k, v in obs.items() if k != "sensor_param"}, "info": info}
-
-
 def _work(
-    pipe: Connection, experiment: Experiment, rows: list[int], env_kwargs: dict
+    pipe: Connection,
+    experiment: Experiment,
+    rows: list[int],
+    env_kwargs: dict[str, Any],
+    environ: dict[str, str],
 ) -> None:
     """Run a worker: answer commands until told to close or the parent is gone."""
+    # The server that forks workers has those of the time when it was started.
+    os.environ.clear()
+    os.environ.update(environ)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     torch.set_num_threads(1)
     # Mesa reads it when the first picture is asked for: workers keep all cores busy, so

@@ -73,7 +73,22 @@ class GpuVectorEnv(ManiSkillVectorEnv):
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict | None = None
     ) -> tuple[dict, dict]:
-        """Reset all envs, or those of `options["env_idx"]`."""
+        """Start a new episode in all envs, or in b of them.
+
+        Args:
+            seed: Env i gets seed + i, or the i-th of a list of N; None goes on with
+                each env's own random stream.
+            options: As for `TouchEnv.reset`, and "env_idx": which envs to reset [b].
+
+        Raises:
+            ValueError: A seed together with "env_idx": ManiSkill would start the random
+                streams of the other envs anew, too.
+        """
+        if seed is not None and "env_idx" in (options or {}):
+            raise ValueError(
+                f"seed: got {seed} for some of the envs, expected None with the option "
+                "'env_idx'; leave 'env_idx' out to seed all envs"
+            )
         if isinstance(seed, int):
             seed = list(range(seed, seed + self.num_envs))
         return super().reset(seed=seed, options=options)
