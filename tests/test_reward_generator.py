@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from torch.nn.functional import one_hot
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.reward_generator import (
@@ -47,14 +48,14 @@ def contact(*touching: tuple[int, int]) -> torch.Tensor:
 def test_the_papers_rewards(
     touching: list[tuple[int, int]], binary: float, per_finger: float
 ) -> None:
-    count = count_fingers(contact(*touching), torch.tensor([1]))
+    count = count_fingers(contact(*touching), torch.tensor([[False, True, False]]))
     assert sparse_reward(LINE, count).item() == pytest.approx(binary)
     assert sparse_reward(TRIANGLE, count).item() == pytest.approx(per_finger)
 
 
 def test_each_env_is_counted_by_its_own_sentence() -> None:
     contacts = contact((3, 0), (4, 0), (5, 2)).repeat(3, 1, 1)
-    count = count_fingers(contacts, torch.tensor([0, 1, 2]))
+    count = count_fingers(contacts, torch.eye(3, dtype=torch.bool))
     assert count.right.tolist() == [2, 0, 1]
     assert count.wrong.tolist() == [1, 3, 2]
 
@@ -64,7 +65,7 @@ def test_counts_are_those_of_a_plain_loop(n: int, f: int, c: int, seed: int) -> 
     generator = torch.Generator().manual_seed(seed)
     contacts = torch.rand(n, f, c, generator=generator) < 0.5
     target = torch.randint(c, (n,), generator=generator)
-    count = count_fingers(contacts, target)
+    count = count_fingers(contacts, one_hot(target, c).bool())
     for row in range(n):
         named = contacts[row, :, target[row]]
         others = [contacts[row, :, k] for k in range(c) if k != target[row]]
@@ -117,14 +118,14 @@ class Scene:
     """What a step of N envs may look like."""
 
     contact: torch.Tensor  # [N, F, C]
-    target: torch.Tensor  # [N]
+    named: torch.Tensor  # [N, C]
     distance: torch.Tensor  # [N, F] [m]
     wrong_once: torch.Tensor  # [N]
 
     def reward(self, experiment: catalog.Experiment, **changes: object) -> torch.Tensor:
         """Return the dense reward, with some of this changed."""
         scene = dataclasses.replace(self, **changes)
-        count = count_fingers(scene.contact, scene.target)
+        count = count_fingers(scene.contact, scene.named)
         rest = (scene.distance, scene.wrong_once, DenseWeights())
         return dense_reward(experiment, count, *rest)
 
@@ -137,7 +138,7 @@ def scenes(draw: st.DrawFn) -> Scene:
     crowd = draw(st.floats(0, 1))
     return Scene(
         torch.rand(n, 6, c, generator=generator) < crowd,
-        torch.randint(c, (n,), generator=generator),
+        one_hot(torch.randint(c, (n,), generator=generator), c).bool(),
         torch.rand(n, 6, generator=generator),
         torch.rand(n, generator=generator) < 0.5,
     )
@@ -169,10 +170,9 @@ def test_rewards_do_not_depend_on_how_envs_fingers_and_objects_are_numbered(
 ) -> None:
     n, f, c = scene.contact.shape
     rows, fingers, things = (random.sample(range(k), k) for k in (n, f, c))
-    places = torch.tensor(things).argsort()  # where each object went
     shuffled = Scene(
         scene.contact[rows][:, fingers][:, :, things],
-        places[scene.target[rows]],
+        scene.named[rows][:, things],
         scene.distance[rows][:, fingers],
         scene.wrong_once[rows],
     )
@@ -188,10 +188,7 @@ def test_coming_nearer_and_sparing_the_others_never_costs(
     assert (scene.reward(experiment, distance=share * scene.distance) >= reward).all()
     spared = torch.zeros_like(scene.wrong_once)
     assert (scene.reward(experiment, wrong_once=spared) >= reward).all()
-    others = torch.ones_like(scene.contact).scatter(
-        2, scene.target[:, None, None].expand(-1, 6, 1), False
-    )
-    alone = scene.contact & ~others
+    alone = scene.contact & scene.named[:, None]
     assert (scene.reward(experiment, contact=alone) >= reward - 1e-6).all()
 
 

@@ -295,6 +295,7 @@ def test_a_reset_forgets_the_touches_of_the_last_episode(fixed: gym.Env) -> None
     assert not obs["extra"]["touch"].any()
     assert not info["success_once"].any()
     assert last["success_once"].all()  # what was told of it stays
+    assert last["elapsed_steps"].tolist() == [12]
 
 
 def test_dense_reward_grows_as_the_hand_comes_near() -> None:

@@ -31,7 +31,7 @@ class InstructionalSet:
         sentences: The I sentences.
         tokens: Token ids, padded with 0 to the longest sentence [I, L] int64.
         targets: Index of the object that each sentence names [I] int64.
-        named: The same, one-hot [I, C] float32.
+        named: The same, one-hot [I, C] bool.
     """
 
     def __init__(self, experiment: Experiment, device: torch.device) -> None:
@@ -42,8 +42,8 @@ class InstructionalSet:
         padded = [row + [PAD] * (length - len(row)) for row in rows]
         self.tokens = torch.tensor(padded, device=device)  # [I, L]
         self.targets = torch.tensor(experiment.targets, device=device)  # [I]
-        count = len(experiment.objects)
-        self.named = torch.eye(count, device=device)[self.targets]  # [I, C]
+        one_hot = torch.eye(len(experiment.objects), dtype=torch.bool, device=device)
+        self.named = one_hot[self.targets]  # [I, C]
 
     def __len__(self) -> int:
         """Return the number of instructions I."""

@@ -24,19 +24,23 @@ class FingerCount:
     """Fingers on any other object [N] int64."""
 
 
-def count_fingers(contact: Tensor, target: Tensor) -> FingerCount:
-    """Count the fingers on the named object and on the others.
+def split_fingers(contact: Tensor, named: Tensor) -> tuple[Tensor, Tensor]:
+    """Return which fingers are on the named object, and which on others [N, F] bool.
 
-    A finger that touches both counts in both.
+    A finger that touches both is in both.
 
     Args:
         contact: Whether finger f touches object c [N, F, C] bool.
-        target: Index of the named object [N] int64.
+        named: Which object is named, one-hot [N, C] bool.
     """
-    index = target[:, None, None].expand(-1, contact.shape[1], 1)  # [N, F, 1]
-    on_target = contact.gather(2, index)[..., 0]  # [N, F]
-    others = contact.scatter(2, index, False)  # [N, F, C]
-    return FingerCount(on_target.sum(1), others.any(2).sum(1))
+    named = named[:, None]  # [N, 1, C]
+    return (contact & named).any(2), (contact > named).any(2)
+
+
+def count_fingers(contact: Tensor, named: Tensor) -> FingerCount:
+    """Count the fingers on the named object and on the others, as `split_fingers`."""
+    right, wrong = split_fingers(contact, named)
+    return FingerCount(right.sum(1), wrong.sum(1))
 
 
 def sparse_reward(experiment: Experiment, count: FingerCount) -> Tensor:

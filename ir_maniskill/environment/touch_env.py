@@ -259,12 +259,24 @@ class TouchEnv(BaseEnv):
         """Index in `objects` of the one that the active sentence names [N] int64."""
         return self.instructional_set.targets.index_select(0, self.instruction_index)
 
+    @property
+    def named(self) -> Tensor:
+        """Which object the active sentence names, one-hot [N, C] bool."""
+        return self.instructional_set.named.index_select(0, self.instruction_index)
+
     def get_language_instruction(self) -> list[str]:
         """Return the active sentence i_t of each env (N strings)."""
         sentences = self.experiment.sentences
         return [sentences[index] for index in self.instruction_index.tolist()]
 
     # -- Measures --------------------------------------------------------------------
+
+    def get_info(self) -> dict[str, Tensor]:
+        """Return what `evaluate` measures, and `elapsed_steps` since the reset [N]."""
+        info = super().get_info()
+        # On the CPU ManiSkill gives its own counter, which it goes on changing.
+        info["elapsed_steps"] = info["elapsed_steps"].clone()
+        return info
 
     def evaluate(self) -> dict[str, Tensor]:
         """Measure contacts and what they mean for the active sentence.
@@ -278,7 +290,7 @@ class TouchEnv(BaseEnv):
         contact = self._contact_force() > TOUCH_FORCE
         if self._fresh:  # PhysX still holds the contacts of the last episode
             contact &= (self._elapsed_steps > 0)[:, None, None]
-        count = reward_generator.count_fingers(contact, self.target_index)
+        count = reward_generator.count_fingers(contact, self.named)
         success = count.right > 0
         self._success_once = self._success_once | success
         self._wrong_once = self._wrong_once | (count.wrong > 0)
@@ -308,8 +320,7 @@ class TouchEnv(BaseEnv):
         }
         if self.obs_mode_struct.use_state:
             obs |= self._positions()
-            named = self.instructional_set.named.index_select(0, index)
-            obs["target_object"] = named  # [N, C]
+            obs["target_object"] = self.named.float()  # [N, C]
             obs["wrong_once"] = info["wrong_once"].float()[:, None]  # [N, 1]
         return obs
 
