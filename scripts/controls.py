@@ -124,7 +124,7 @@ def main() -> None:
     parser.add_argument(
         "policies", nargs="*", type=Path, help="files; default: all that ship"
     )
-    parser.add_argument("--episodes", type=int, default=60, help="of each control")
+    parser.add_argument("--episodes", type=int, default=120, help="of each control")
     parser.add_argument("--num-envs", type=int, default=8)
     parser.add_argument("--out", type=Path, default=OUT)
     given = parser.parse_args()

@@ -5,8 +5,9 @@
 
 Taking a run in copies its config, its evaluations and its final figures (some kB) to
 docs/results/runs, so that the pages can be written anew without the run's folder. The
-tables stand between markers in docs/results/README.md and, the short one, in README.md;
-all else there is written by hand.
+tables stand between markers in docs/results/README.md and, the short ones, in
+README.md; all else there is written by hand, but for the sections that stay away while
+nothing has been recorded for them.
 """
 
 from __future__ import annotations
@@ -44,16 +45,32 @@ PAPER = {
     "NaoTouchCubeTriangle-v1": 3.1,
 }
 """The paper's mean return, read as right fingers a step; the page says why."""
+UNCOPIED = ("env_id", "out", "num_workers", "threads", "checkpoint_interval")
+"""Fields of a config that need not be repeated to repeat a run."""
 UNTOLD = (
-    *("env_id", "out", "seed", "total_steps", "num_envs", "num_workers", "threads"),
-    *("eval_interval", "eval_episodes", "eval_seed", "checkpoint_interval"),
-    "stop_at_success",
+    *(*UNCOPIED, "seed", "total_steps", "num_envs"),
+    *("eval_interval", "eval_episodes", "eval_seed", "stop_at_success"),
 )
 """Fields of a config that do not tell one way of learning from another."""
 LAYOUTS = ("Single", "Multi", "Triangle", "Shuffled")
 """Order of the tasks on the page."""
 EXCLUSIVE = "eval/exclusive"
 NOTHING = "*Nothing has been recorded yet.*"
+SHUFFLED = "NaoTouchCubeShuffled-v1"
+"""The task whose film and controls the README shows by themselves."""
+
+PAPER_SETTINGS = """\
+## The paper's settings
+
+The preset `paper` on the same tasks and in the same scenes: after how many steps an
+evaluation first reached the level named, for each seed; *of* says how long the paper's
+preset was trained."""
+ONE_SETTING = """\
+## What one setting changes
+
+Runs that differ from the preset `default` in one field, beside the preset itself: the
+worst sentence of the worst seed in the end, and exclusive success of both in the
+choosing evaluations after equally many steps."""
 
 OBEYS = 0.95
 """Share of exclusive episodes from which a way of learning counts as successful."""
@@ -101,9 +118,18 @@ class Run:
         """How it learned: the preset, and what differs from it."""
         return ", ".join([f"`{self.preset}`", *self.changes])
 
-    def _changes(self, preset: str) -> dict[str, Any]:
-        theirs = _flat(asdict(CONFIGS[preset]))
-        mine = _flat(self.config).items()
+    @property
+    def command(self) -> str:
+        """How to train it with today's presets."""
+        changes = self._changes(self.preset, UNCOPIED).items()
+        flags = [f"--out runs/{self.name}"]
+        flags += ["--preset paper"] if self.preset == "paper" else []
+        flags += [_flag(key, value) for key, value in changes]
+        return " ".join([f"ir-maniskill train {self.task}", *flags])
+
+    def _changes(self, preset: str, untold: Sequence[str] = UNTOLD) -> dict[str, Any]:
+        theirs = _flat(asdict(CONFIGS[preset]), untold)
+        mine = _flat(self.config, untold).items()
         return {key: value for key, value in mine if value != theirs.get(key)}
 
     def steps_to(self, column: str, level: float) -> int | None:
@@ -171,19 +197,30 @@ def _json(path: Path) -> dict[str, Any]:
     return json.loads(path.read_text()) if path.exists() else {}
 
 
-def _flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return the telling fields of a config, nested ones with dots in their names."""
+def _flat(
+    config: Mapping[str, Any], untold: Sequence[str], prefix: str = ""
+) -> dict[str, Any]:
+    """Return all other fields of a config, nested ones with dots in their names."""
     flat: dict[str, Any] = {}
     for key, value in config.items():
         if isinstance(value, Mapping):
-            flat |= _flat(value, f"{prefix}{key}.")
-        elif prefix or key not in UNTOLD:
+            flat |= _flat(value, (), f"{prefix}{key}.")
+        elif key not in untold:
             flat[prefix + key] = list(value) if isinstance(value, tuple) else value
     return flat
 
 
 def _plain(value: Any) -> str:
     return "+".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def _flag(key: str, value: Any) -> str:
+    """Return the option of `ir-maniskill train` that sets a field."""
+    *group, name = key.replace("_", "-").split(".")
+    if isinstance(value, bool):
+        return "--" + ".".join([*group, name if value else f"no-{name}"])
+    values = value if isinstance(value, list) else [value]
+    return " ".join(["--" + ".".join([*group, name]), *map(str, values)])
 
 
 # -- Groups --------------------------------------------------------------------------
@@ -340,14 +377,14 @@ def limit_table(oracle: Mapping[str, Figures], policies: Mapping[str, Figures]) 
 
 
 def headline_table(groups: Iterable[Group]) -> str:
-    """Return one row for each task: its worst sentence with its worst seed."""
+    """Return one row for each task: each figure's lowest over sentences and seeds."""
     head = (
-        *("task", "seeds", "steps", "minutes", "episodes a sentence"),
+        *("task", "learned with", "seeds", "steps", "minutes", "episodes a sentence"),
         *("success", "exclusive", "touching", "right fingers"),
     )
     rows = [
         (
-            *(f"`{group.task}`", *group.effort),
+            *(f"`{group.task}`", group.label, *group.effort),
             group.episodes,
             *(_lowest(group.scores, name) for name in ("success", "exclusive")),
             *_reached(group)[2:],
@@ -358,7 +395,7 @@ def headline_table(groups: Iterable[Group]) -> str:
 
 
 def seeds_table(groups: Iterable[Group]) -> str:
-    """Return, for every way of learning, what its worst seed and sentence reach."""
+    """Return, for every way of learning, the lowest over its sentences and seeds."""
     head = (
         *("task", "learned with", "seeds", "steps", "minutes", "episodes a sentence"),
         *("success", "exclusive", "touching", "right fingers", "paper's level after"),
@@ -372,6 +409,25 @@ def seeds_table(groups: Iterable[Group]) -> str:
         )
         for group in groups
     ]
+    return table(head, rows)
+
+
+def fingers_table(
+    policies: Mapping[str, Figures], oracle: Mapping[str, Figures]
+) -> str:
+    """Return the paper's fingers a step, the shipped policies', and the oracle's."""
+    head = ("task", "the paper", "shipped policy", "scripted search, at least")
+    rows = []
+    for task, level in PAPER.items():
+        told = policies.get(task, {}).get("instructions", {})
+        ours = [score["right_fingers"] for score in told.values()]
+        found = [
+            max(goal["right_fingers"] for goal in goals.values())
+            for goals in oracle.get(task, {}).get("instructions", {}).values()
+        ]
+        part = f" ({len(found)} of {len(ours)} sentences)" if found else ""
+        bound = _mean(found) + (part if len(found) < len(ours) else "")
+        rows.append((f"`{task}`", f"{level:g}", _mean(ours), bound))
     return table(head, rows)
 
 
@@ -443,7 +499,7 @@ def paper_table(groups: Sequence[Group]) -> str:
 
 def scenes_table(policies: Mapping[str, Figures]) -> str:
     """Return how often each shipped policy obeys all sentences in the same scene."""
-    head = ("task", "scenes", "all sentences", "the least of two sentences")
+    head = ("task", "scenes", "all sentences", "worst pair of sentences")
     rows = [
         (
             *(f"`{task}`", str(same["scenes"]), _share(same, "exclusive")),
@@ -488,10 +544,14 @@ def _worst(scores: Iterable[Figures], name: str) -> str:
 
 
 def _reached(group: Group) -> Cells:
-    """Return what the worst seed and sentence reach, as four cells."""
+    """Return four cells, each the lowest over sentences and seeds."""
     shares = ("success", "exclusive", "touching")
     fingers = min(score["right_fingers"] for score in group.scores)
     return (*(_worst(group.scores, name) for name in shares), f"{fingers:.2f}")
+
+
+def _mean(values: Sequence[float]) -> str:
+    return f"{np.mean(values):.2f}" if values else ""
 
 
 def _span(numbers: Iterable[str]) -> str:
@@ -517,7 +577,9 @@ def _steps_to(group: Group, column: str, level: float | None) -> str:
     if level is None:
         return ""
     steps = [run.steps_to(column, level) for run in group.runs]
-    return ", ".join("not" if n is None else f"{n / 1000:.0f} k" for n in steps)
+    if not any(steps):
+        return "never"
+    return ", ".join("never" if n is None else f"{n / 1000:.0f} k" for n in steps)
 
 
 # -- Page ----------------------------------------------------------------------------
@@ -539,14 +601,31 @@ def draw(wanted: Pictures, folder: Path) -> None:
 
 
 def films(folder: Path = IMAGES) -> str:
-    """Return the films of shipped policies that there are, two in a row."""
-    cells = [
-        f'`{task}`<br><img src="docs/images/{task}.gif" width="400" alt="{task}">'
+    """Return the films of shipped policies that there are, two in a row.
+
+    They stand in a table of HTML, in which the last may take a row of its own.
+    """
+    image = '<code>{0}</code><br><img src="docs/images/{0}.gif" width="400" alt="{0}">'
+    shown = [
+        image.format(task)
         for task in tasks()
-        if (folder / f"{task}.gif").is_file()
+        if task != SHUFFLED and (folder / f"{task}.gif").is_file()
     ]
-    rows = [cells[first : first + 2] for first in range(0, len(cells), 2)]
-    return table(("", ""), [[*row, ""][:2] for row in rows])
+    rows = []
+    for first in range(0, len(shown), 2):
+        pair = shown[first : first + 2]
+        cell = "<td>" if len(pair) == 2 else '<td colspan="2" align="center">'
+        rows.append("<tr>" + "".join(f"{cell}{film}</td>" for film in pair) + "</tr>")
+    return "\n".join(["<table>", *rows, "</table>"]) if rows else NOTHING
+
+
+def section(intro: str, body: str, names: Iterable[str]) -> str:
+    """Return a section with its heading, or nothing if it has nothing to show."""
+    return "" if body == NOTHING else "\n\n".join([intro, body, *_curves(names)])
+
+
+def _curves(names: Iterable[str]) -> list[str]:
+    return [f"![Learning curves: {name}]({name}.png)" for name in names]
 
 
 def sections(folder: Path = FOLDER, policies: Path = POLICIES) -> dict[str, str]:
@@ -555,23 +634,22 @@ def sections(folder: Path = FOLDER, policies: Path = POLICIES) -> dict[str, str]
     oracle, controls = (
         _ordered(_json(folder / f"{name}.json")) for name in ("oracle", "controls")
     )
-    shown = {
-        section: "\n\n".join(
-            f"![Learning curves: {name}]({name}.png)" for name in names
-        )
-        for section, names in pictures(groups, shipped).items()
-    }
+    drawn = pictures(groups, shipped)
+    commands = [f"    {run.command}" for group in groups for run in group.runs]
     return {
         "headline": headline_table(chosen(groups, shipped).values()),
         "films": films(),
+        "looks": controls_table({k: v for k, v in controls.items() if k == SHUFFLED}),
+        "fingers": fingers_table(shipped, oracle),
         "shipped": shipped_table(shipped),
         "scenes": scenes_table(shipped),
         "limit": limit_table(oracle, shipped),
-        "curves": shown["curves"] or NOTHING,
+        "curves": "\n\n".join(_curves(drawn["curves"])) or NOTHING,
         "seeds": seeds_table(groups),
-        "paper": f"{paper_table(groups)}\n\n{shown['paper']}".rstrip(),
-        "ablations": f"{ablations_table(groups)}\n\n{shown['ablations']}".rstrip(),
+        "paper": section(PAPER_SETTINGS, paper_table(groups), drawn["paper"]),
+        "ablations": section(ONE_SETTING, ablations_table(groups), drawn["ablations"]),
         "controls": controls_table(controls),
+        "commands": "\n".join(commands) or NOTHING,
     }
 
 
@@ -598,7 +676,7 @@ def fill(page: str, texts: Mapping[str, str]) -> str:
                 f"names {', '.join(texts)}"
             )
         pattern = re.compile(f"{re.escape(begin)}.*?{re.escape(end)}", re.DOTALL)
-        new = f"{begin}\n{texts[name]}\n{end}"
+        new = "\n".join(filter(None, (begin, texts[name], end)))
         page = pattern.sub(lambda _, new=new: new, page)  # type: ignore[misc]
     return page
 

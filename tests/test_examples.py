@@ -178,6 +178,7 @@ def test_readme_tells_the_numbers_of_the_presets() -> None:
             "action noise": f"{agent.std}",
             "roll-outs an update": f"{ppo.rollouts}",
             "epochs": f"{ppo.epochs}",
+            "learning rate": f"about {ppo.target_kl}" if ppo.target_kl else "",
             "minibatch": f"{ppo.minibatch or 'all steps'}",
             "advantage": f"λ = {ppo.gae_lambda:g}",
             "discount γ": f"{ppo.gamma}",
@@ -187,15 +188,30 @@ def test_readme_tells_the_numbers_of_the_presets() -> None:
         }
         for start, text in expected.items():
             assert text in row(start)[column], start
-        assert float(row("learning rate")[column]) == ppo.learning_rate
+        rate = row("learning rate")[column].split()[0]
+        assert float(rate) == ppo.learning_rate
+    assert row("action noise")[3].endswith(
+        f"falling to {CONFIGS['default'].agent.std_final}"
+    )
     assert f"at most {HAND.delta} of" in README and HAND.delta == ARM.delta
 
 
-def test_readme_links_lead_somewhere() -> None:
-    links = re.findall(r"\]\((?!http)([^)]+)\)", README)
-    assert len(links) > 15
-    files = [link.split("#")[0] for link in links]
-    assert [file for file in files if not (ROOT / file).exists()] == []
+PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
+
+
+def headings(page: Path) -> set[str]:
+    """Returns the anchors of a page's headings, as GitHub names them."""
+    titles = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", t.lower()).replace(" ", "-") for t in titles}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_links_lead_somewhere(page: Path) -> None:
+    links = re.findall(r"\]\((?!http)([^)]+)\)", page.read_text())
+    for file, _, anchor in (link.partition("#") for link in links):
+        target = page.parent / file if file else page
+        assert target.exists(), file
+        assert not anchor or anchor in headings(target), anchor
 
 
 @pytest.mark.render

@@ -8,6 +8,7 @@ import pytest
 import results
 from results import ResultsError, Run
 
+from ir_maniskill import cli
 from ir_maniskill.training import plots
 from ir_maniskill.training.config import CONFIGS, to_json
 
@@ -86,6 +87,30 @@ def test_a_label_is_the_nearest_preset_and_what_differs():
     assert run.label == "`default`, agent.senses vision+touch, reward_mode sparse"
 
 
+NEEDLESS = dict.fromkeys(["env_id", "out", *("num_workers", "threads")])
+NEEDLESS |= {"checkpoint_interval": 1}
+
+
+def trained_by(command):
+    """The config that a command of the page trains, but for the machine's part."""
+    config = json.loads(to_json(cli.parse(command.split()[1:]).config))
+    return config | NEEDLESS
+
+
+@pytest.mark.parametrize("run", results.kept(), ids=lambda run: run.name)
+def test_the_command_of_a_recorded_run_trains_it_again(run):
+    assert trained_by(run.command) == run.config | NEEDLESS
+    assert f"train {run.task} --out runs/{run.name}" in run.command
+
+
+def test_a_command_can_turn_off_what_the_preset_has_and_start_from_the_papers():
+    run = make_run(preset="paper", stop_at_success=0.5)
+    assert trained_by(run.command) == run.config | NEEDLESS
+    run = changed(3, film=False, hidden=[20, 10])
+    assert trained_by(run.command) == run.config | NEEDLESS
+    assert run.command.endswith("--seed 3 --agent.no-film --agent.hidden 20 10")
+
+
 def test_runs_that_differ_by_seed_only_are_one_group():
     runs = [make_run(seed=1), make_run(preset="paper"), make_run(seed=0)]
     groups = results.grouped(runs)
@@ -113,10 +138,10 @@ def test_the_worst_seed_and_sentence_count():
     runs = [make_run(0), make_run(1, fingers=(1, 2), report=weak())]
     row = cells(results.seeds_table(results.grouped(runs)))
     assert row[2] == "0, 1"
-    assert row[6:] == ["100.0%", "25.0%", "80.0%", "2.00", "2 k, not"]
+    assert row[6:] == ["100.0%", "25.0%", "80.0%", "2.00", "2 k, never"]
     row = cells(results.headline_table(results.grouped(runs)))
-    assert row[:4] == [f"`{TRIANGLE}`", "0, 1", "2 k", "2"]
-    assert row[6:] == ["25.0% [40.0, 60.0]", "80.0%", "2.00"]
+    assert row[:5] == [f"`{TRIANGLE}`", "`default`", "0, 1", "2 k", "2"]
+    assert row[7:] == ["25.0% [40.0, 60.0]", "80.0%", "2.00"]
 
 
 def test_the_readme_speaks_of_what_ships_or_else_of_what_is_nearest_the_default():
@@ -157,7 +182,7 @@ def test_presets_are_compared_by_the_steps_to_the_same_levels():
     )
     text = results.paper_table(groups)
     assert cells(text, 1)[2:] == ["2 k, 1 k", "3 k", "2 k"]
-    assert cells(text, 0)[2:4] == ["not, not", "not"]
+    assert cells(text, 0)[2:4] == ["never", "never"]
     assert results.rivals(groups[:1]) == {}
 
 
@@ -185,13 +210,35 @@ def test_the_policy_is_compared_with_the_limit_of_its_sentence():
     assert cells[8:] == ["80.0%", "80.0%", "1.00 |"]
 
 
+def test_fingers_are_means_over_sentences_and_the_oracles_its_best_plans():
+    goals = {name: {"right_fingers": f} for name, f in (("a", 4.0), ("b", 2.0))}
+    oracle = {TRIANGLE: {"instructions": {BLUE: goals}}}
+    told = {BLUE: score(), "b": score(fingers=2.0)}
+    shipped = {TRIANGLE: {"instructions": told}}
+    text = results.fingers_table(shipped, oracle)
+    assert cells(text, 2)[1:] == ["3.1", "2.50", "4.00 (1 of 2 sentences)"]
+    assert cells(text, 0)[1:] == ["2.4", "", ""]
+    del told["b"]
+    text = results.fingers_table(shipped, oracle)
+    assert cells(text, 2)[2:] == ["3.00", "4.00"]
+
+
 def test_the_films_that_there_are_stand_two_in_a_row(tmp_path):
-    for task in ("NaoTouchCubeMulti-v1", "NaoTouchCubeShuffled-v1", TRIANGLE):
-        (tmp_path / f"{task}.gif").touch()
-    text = results.films(tmp_path)
-    assert "Multi" in cells(text)[0] and TRIANGLE in cells(text)[1]
-    assert "Shuffled" in cells(text, 1)[0] and cells(text, 1)[1] == ""
+    for name in ("CubeSingle", "CubeMulti", "CubeShuffled", "ButtonMulti"):
+        (tmp_path / f"NaoTouch{name}-v1.gif").touch()
+    first, last = results.films(tmp_path).splitlines()[1:-1]
+    assert "CubeSingle" in first and "CubeMulti" in first and first.count("<td") == 2
+    assert "ButtonMulti" in last and last.count('<td colspan="2"') == 1
     assert results.films(tmp_path / "none") == results.NOTHING
+
+
+def test_a_section_without_records_stays_away_with_its_heading():
+    nothing = results.table(("a",), [])
+    assert results.section("## Heading", nothing, []) == ""
+    text = results.section("## Heading", "| a |", ["b"])
+    assert text == "## Heading\n\n| a |\n\n![Learning curves: b](b.png)"
+    page = "a\n<!-- begin x -->\nold\n<!-- end x -->\n"
+    assert results.fill(page, {"x": ""}) == "a\n<!-- begin x -->\n<!-- end x -->\n"
 
 
 def test_only_what_stands_between_markers_is_written():
