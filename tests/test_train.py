@@ -1,16 +1,20 @@
+import contextlib
 import csv
 import dataclasses
+import itertools
 import json
 
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from toy_envs import LENGTH, ToyVectorEnv, toy_config
 
 from ir_maniskill.training import checkpoint
 from ir_maniskill.training import train as training
 from ir_maniskill.training.checkpoint import CheckpointError
-from ir_maniskill.training.config import AgentConfig, TrainConfig
+from ir_maniskill.training.config import AgentConfig, ConfigError, TrainConfig
 from ir_maniskill.training.finite import TrainingDivergedError
+from ir_maniskill.training.run_folder import RunFolder
 from ir_maniskill.training.train import train
 
 UPDATE = 32 * LENGTH  # steps of an update of the toy task
@@ -22,7 +26,8 @@ def few_final_episodes(monkeypatch):
 
 
 def run(config, **kwargs):
-    return train(config, envs=ToyVectorEnv(config.num_envs), **kwargs)
+    envs = ToyVectorEnv(config.num_envs, env_id=config.env_id)
+    return train(config, envs=envs, **kwargs)
 
 
 def rows(folder, table):
@@ -145,12 +150,64 @@ def test_whatever_stops_it_the_last_complete_update_is_kept(tmp_path, interrupt,
     assert stored.metadata["steps"] == UPDATE
 
 
+@pytest.mark.parametrize(
+    ("owner", "name", "late"),
+    [
+        (training, "evaluate_policy", False),
+        (checkpoint, "save_policy", True),
+        (RunFolder, "log", True),
+    ],
+)
+def test_an_evaluation_that_is_interrupted_is_made_on_resuming(
+    tmp_path, monkeypatch, owner, name, late
+):
+    changes = {"total_steps": 2 * UPDATE, "eval_interval": UPDATE}
+    run(toy_config(tmp_path / "whole", **changes))
+    work, calls = getattr(owner, name), itertools.count()
+
+    def interrupted(*arguments, **keywords):
+        stop = next(calls) % 2 == 0
+        result = work(*arguments, **keywords) if late or not stop else None
+        if stop:
+            raise KeyboardInterrupt
+        return result
+
+    monkeypatch.setattr(owner, name, interrupted)
+    finished = False
+    while not finished:
+        with contextlib.suppress(KeyboardInterrupt):
+            run(toy_config(tmp_path / "parts", **changes), resume=True)
+            finished = True
+    assert next(calls) > 2
+    whole, parts = (
+        (
+            rows(folder, "evaluations"),
+            checkpoint.read(folder / "last.safetensors").metadata["best_score"],
+            (folder / "evaluation.json").read_text(),
+        )
+        for folder in (tmp_path / "whole", tmp_path / "parts")
+    )
+    assert parts == whole
+    assert_same(tensors(tmp_path / "whole"), tensors(tmp_path / "parts"))
+
+
 def test_records_of_steps_made_again_are_dropped(tmp_path, interrupt):
     interrupt(4)
     with pytest.raises(KeyboardInterrupt):
         run(toy_config(tmp_path))
     run(toy_config(tmp_path), resume=True)
     steps = [int(row["steps"]) for row in rows(tmp_path, "metrics")]
+    assert steps == [UPDATE * i for i in (1, 2, 3, 4)]
+
+
+def test_curves_have_no_points_of_steps_made_again(tmp_path, interrupt):
+    interrupt(4, TrainingDivergedError)  # leaves the checkpoint of the second update
+    with pytest.raises(TrainingDivergedError):
+        run(toy_config(tmp_path))
+    assert [int(row["steps"]) for row in rows(tmp_path, "metrics")][-1] == 3 * UPDATE
+    run(toy_config(tmp_path), resume=True)
+    events = EventAccumulator(str(tmp_path)).Reload()
+    steps = [point.step for point in events.Scalars("train/reward")]
     assert steps == [UPDATE * i for i in (1, 2, 3, 4)]
 
 
@@ -167,6 +224,31 @@ def test_a_folder_with_a_run_is_not_overwritten(tmp_path):
     run(config)
     with pytest.raises(CheckpointError, match="already holds a run: resume"):
         run(config)
+
+
+@pytest.mark.parametrize(
+    ("envs", "message"),
+    [
+        (ToyVectorEnv(4), "num_envs: got a vector of 4 envs, expected 8"),
+        (ToyVectorEnv(8, env_id="B-v1"), "env_id: got 'Toy-v1', expected 'B-v1'"),
+    ],
+)
+def test_envs_that_are_not_the_configs_are_refused(tmp_path, envs, message):
+    with pytest.raises(ConfigError, match=message):
+        train(toy_config(tmp_path), envs=envs)
+
+
+def test_too_few_episodes_for_the_sentences_are_refused_before_training(tmp_path):
+    with pytest.raises(ConfigError, match="eval_episodes: got 1, expected at least 2"):
+        run(toy_config(tmp_path, eval_episodes=1))
+    assert not (tmp_path / "metrics.csv").exists()
+
+
+def test_the_last_evaluation_has_an_episode_for_every_sentence(tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "FINAL_EPISODES", 1)
+    run(toy_config(tmp_path, total_steps=UPDATE))
+    report = json.loads((tmp_path / "evaluation.json").read_text())
+    assert (report["episodes"], report["reward_mode"]) == (2, "dense")
 
 
 @pytest.mark.parametrize(

@@ -21,13 +21,13 @@ class ToyVectorEnv:
     It offers what `make_vec` promises: same-step reset, final observation and info.
     """
 
-    def __init__(self, num_envs=8, images=False):
+    def __init__(self, num_envs=8, images=False, env_id="Toy-v1"):
         self.num_envs, self.images = num_envs, images
         self.device = torch.device("cpu")
         self.single_action_space = Box(-1, 1, (JOINTS,))
         senses = ("vision", "proprioception") if images else ("proprioception",)
         self.experiment = SimpleNamespace(
-            sentences=SENTENCES, senses=senses, vocabulary=VOCABULARY
+            id=env_id, sentences=SENTENCES, senses=senses, vocabulary=VOCABULARY
         )
         self.joints = torch.zeros(num_envs, JOINTS)
         self.told = torch.zeros(num_envs, dtype=torch.long)

@@ -23,9 +23,6 @@ log = logging.getLogger(__name__)
 SPARE_BYTES = 200_000_000
 """Room a run asks for before it starts [byte]: checkpoints and logs."""
 
-TABLES = ("metrics", "evaluations")
-"""The CSV tables of a run."""
-
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """What asks a training to stop."""
 
@@ -71,8 +68,11 @@ class RunFolder:
                 f"{SPARE_BYTES / 1e6:.0f} MB; free some, or choose another folder"
             )
 
-    def begin(self, config: TrainConfig, steps: int) -> None:
+    def begin(self, config: TrainConfig, steps: int) -> int:
         """Write the config, and drop records of steps that will be made again.
+
+        Returns:
+            The steps of the last evaluation recorded; 0 if there is none.
 
         Raises:
             CheckpointError: if another training is using the folder.
@@ -80,13 +80,20 @@ class RunFolder:
         self._take()
         for leftover in self.path.glob(".*.tmp"):  # of a process that was killed
             leftover.unlink()
-        self._events = SummaryWriter(str(self.path))
+        self._events = SummaryWriter(str(self.path), purge_step=steps + 1)
         text = to_json(config) + "\n"
         checkpoint.replace(self.path / "config.json", text.encode())
-        for table in (self.path / f"{name}.csv" for name in TABLES):
-            if table.exists():
-                rows = [row for row in _rows(table) if int(row["steps"]) <= steps]
-                checkpoint.replace(table, _format(rows, header=True))
+        self._cut("metrics", steps)
+        return self._cut("evaluations", steps)
+
+    def _cut(self, name: str, steps: int) -> int:
+        """Drop the rows after `steps` of a table; return the steps of the last kept."""
+        table = self.path / f"{name}.csv"
+        if not table.exists():
+            return 0
+        rows = [row for row in _rows(table) if int(row["steps"]) <= steps]
+        checkpoint.replace(table, _format(rows, header=True))
+        return int(rows[-1]["steps"]) if rows else 0
 
     def _take(self) -> None:
         """Hold the folder until this process ends or calls `close`."""

@@ -5,8 +5,9 @@ import dataclasses
 import json
 import math
 import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -31,7 +32,8 @@ MAY_CHANGE = {
 """Fields of the config that a resumed run may set anew."""
 
 FINAL_EPISODES = 100
-"""Episodes of the last evaluation, of the policy that is kept."""
+"""Episodes of the last evaluation, of the policy that is kept; one for each sentence
+if those are more."""
 
 
 def train(
@@ -46,11 +48,12 @@ def train(
     Args:
         config: task, learner, budget and folder.
         resume: go on from the folder's last checkpoint, if there is one.
-        envs: vector of envs to use (and leave open) instead of making one.
+        envs: vector of this rank's envs to use (and leave open) instead of making one.
 
     Raises:
         CheckpointError: if the folder or its checkpoint cannot be used.
-        ConfigError: if the envs cannot be shared evenly among the ranks.
+        ConfigError: if the envs cannot be shared evenly among the ranks, those given
+            are others than the config says, or an evaluation has too few episodes.
         RankError: if another rank failed.
         TrainingDivergedError: if a number stopped being finite.
         WorkerError: if a simulator process died or hangs.
@@ -66,6 +69,7 @@ def train(
         if envs is None:
             envs = _make_envs(config)
             leaving.callback(envs.close)
+        _require_fit(config, envs)
         trainer = Trainer(config, envs, folder)
         if distributed.from_first(lambda: resume and folder.last.exists()):
             trainer.restore()
@@ -95,6 +99,27 @@ def _require_shares(config: TrainConfig) -> None:
         )
 
 
+def _require_fit(config: TrainConfig, envs: VectorEnv) -> None:
+    """Raise unless the envs are those of the config, and it evaluates them wholly."""
+    task, share = envs.experiment.id, config.num_envs // distributed.size()
+    if task != config.env_id:
+        raise ConfigError(
+            f"env_id: got {config.env_id!r}, expected {task!r}, the task of the envs "
+            "given; change it, or make envs of that task"
+        )
+    if envs.num_envs != share:
+        raise ConfigError(
+            f"num_envs: got a vector of {envs.num_envs} envs, expected {share}, which "
+            f"is this rank's share of {config.num_envs}; change one of them"
+        )
+    sentences = len(envs.experiment.sentences)
+    if config.eval_episodes < sentences:
+        raise ConfigError(
+            f"eval_episodes: got {config.eval_episodes}, expected at least "
+            f"{sentences}, one for each sentence"
+        )
+
+
 def _make_envs(config: TrainConfig) -> VectorEnv:
     """Make this rank's envs, on its device."""
     device, kwargs = distributed.device(), config.env_kwargs(training=True)
@@ -118,6 +143,9 @@ class Trainer:
     are in the checkpoint; the others draw anew from (seed, steps, rank) after it.
     """
 
+    newest: Stored
+    """Snapshot after the last complete update."""
+
     def __init__(self, config: TrainConfig, envs: VectorEnv, folder: RunFolder) -> None:
         """Make an untrained agent for these envs."""
         config = _for_experiment(config, envs.experiment)
@@ -126,7 +154,7 @@ class Trainer:
         self.stack = StateStack(config.frames)
         torch.manual_seed(config.seed)
         torch.set_num_threads(1)  # orthogonal weights depend on it in their last bits
-        self.steps, self.best_score = 0, -math.inf
+        self.steps, self.evaluated, self.best_score = 0, 0, -math.inf
         self.reward_scale = RewardScale(envs.num_envs, config.ppo.gamma)
         self.state = self._fresh_scenes()
         actions = math.prod(envs.single_action_space.shape or ())
@@ -141,30 +169,27 @@ class Trainer:
         """Train until the steps are used up or the goal is reached."""
         size = self.config.steps_per_update
         total = math.ceil(self.config.total_steps / size) * size
-        distributed.from_first(lambda: self.folder.begin(self.config, self.steps))
-        snapshot = self.snapshot()
-        self._write(snapshot)  # shows at once that we can
-        reached, silent = False, distributed.rank() > 0
-        with tqdm(
-            total=total, initial=self.steps, unit=" steps", disable=silent
-        ) as bar:
-            try:
-                while self.steps < total and not reached:
+        self.evaluated = distributed.from_first(
+            lambda: self.folder.begin(self.config, self.steps)
+        )
+        self.newest = self.snapshot()
+        self._write()  # shows at once that we can
+        silent, reached = distributed.rank() > 0, False
+        bar = tqdm(total=total, initial=self.steps, unit=" steps", disable=silent)
+        with bar, self._kept_at_last():
+            while not reached:
+                if self._evaluation_is_due(total):
+                    reached = self._evaluate_and_save()
+                elif self.steps < total:
                     figures = self.update()
-                    snapshot = self.snapshot()
+                    self.newest = self.snapshot()
                     bar.set_postfix_str(_summary(figures))
                     bar.update(size)
-                    if self._due(self.config.eval_interval) or self.steps >= total:
-                        reached = self._reached(distributed.from_first(self.evaluate))
-                        snapshot = self.snapshot()  # the best score may be new
-                        self.save(snapshot)  # the evaluation left scenes in disorder
-                    elif self._due(self.config.checkpoint_interval):
-                        self.save(snapshot)
-            except BaseException as error:
-                diverged = isinstance(error, TrainingDivergedError)
-                if not silent and not diverged:  # then the older one is the good one
-                    self.folder.save_at_last(snapshot)
-                raise
+                    due = self._due(self.config.checkpoint_interval)
+                    if due and not self._evaluation_is_due(total):
+                        self.save()
+                else:
+                    break
         distributed.from_first(self.confirm)
 
     def update(self) -> dict[str, float]:
@@ -200,12 +225,25 @@ class Trainer:
             self.folder.log("metrics", self.steps, figures)
         return figures
 
+    def _evaluate_and_save(self) -> bool:
+        """Return whether an evaluation, made now, finds the goal reached."""
+        figures = distributed.from_first(self.evaluate)
+        self.newest = self.snapshot()  # the best score may be new
+        self.save()  # the evaluation left scenes in disorder
+        if distributed.rank() == 0:  # at last: what has no record is made again
+            self.folder.log("evaluations", self.steps, figures)
+        self.evaluated = self.steps
+        goal = self.config.stop_at_success
+        return goal is not None and figures["eval/worst"] >= goal
+
     def evaluate(self) -> dict[str, float]:
-        """Evaluate the policy on pinned scenes; keep it if it is the best so far."""
+        """Evaluate the policy on pinned scenes; keep it if it is the best so far.
+
+        The best has the highest sum, equally weighted, of the worst sentence's success,
+        the exclusive success and the share of steps in touch.
+        """
         report = self._report(self.agent, self.config.eval_episodes)
         figures = _figures(report)
-        self.folder.log("evaluations", self.steps, figures)
-        # Success first; among equals the one that touches only the right object, long.
         score = sum(figures[f"eval/{k}"] for k in ("worst", "exclusive", "touching"))
         if score > self.best_score:
             self.best_score = score
@@ -216,11 +254,10 @@ class Trainer:
         """Evaluate the best policy on other scenes than those it was chosen by."""
         agent, _, metadata = checkpoint.load_policy(self.folder.best)
         agent.to(self.device)
-        report = self._report(
-            agent, FINAL_EPISODES, seed=self.config.eval_seed + 50_000
-        )
-        self._keep(agent, metadata["steps"], report)
-        text = json.dumps(report.as_dict(), indent=2)
+        episodes = max(FINAL_EPISODES, len(self.envs.experiment.sentences))
+        report = self._report(agent, episodes, seed=self.config.eval_seed + 50_000)
+        figures = self._keep(agent, metadata["steps"], report)
+        text = json.dumps(figures, indent=2)
         path = self.folder.path / "evaluation.json"
         checkpoint.replace(path, (text + "\n").encode())
 
@@ -238,14 +275,26 @@ class Trainer:
         tensors |= checkpoint.pack(self.agent, self.optimizer)
         return Stored(checkpoint.CHECKPOINT, tensors, metadata)
 
-    def save(self, snapshot: Stored) -> None:
+    def save(self) -> None:
         """Write a complete checkpoint, and go on with fresh scenes as a resumed run."""
-        self._write(snapshot)
+        self._write()
         self.state = self._fresh_scenes()
 
-    def _write(self, snapshot: Stored) -> None:
-        """Write the first rank's snapshot as the last checkpoint."""
-        distributed.from_first(lambda: self.folder.save(snapshot))
+    def _write(self) -> None:
+        """Write the first rank's newest snapshot as the last checkpoint."""
+        distributed.from_first(lambda: self.folder.save(self.newest))
+
+    @contextlib.contextmanager
+    def _kept_at_last(self) -> Iterator[None]:
+        """Leave the newest snapshot as the last checkpoint, whatever stops it."""
+        try:
+            yield
+        except BaseException as error:
+            diverged = isinstance(error, TrainingDivergedError)
+            # Where it diverged, the older checkpoint is the good one.
+            if distributed.rank() == 0 and not diverged:
+                self.folder.save_at_last(self.newest)
+            raise
 
     def restore(self) -> None:
         """Go on from the folder's last checkpoint.
@@ -302,26 +351,28 @@ class Trainer:
             self.config.env_id,
             episodes=episodes,
             seed=self.config.eval_seed if seed is None else seed,
-            num_envs=self.envs.num_envs,
             frames=self.config.frames,
-            env_kwargs=self.config.env_kwargs(training=True),
             envs=self.envs,
         )
         checkpoint.set_random_state(tensors, plain)
         return report
 
-    def _keep(self, agent: Agent, steps: int, report: EvaluationReport) -> None:
-        """Write the policy as the best one."""
-        figures = report.as_dict()
+    def _keep(
+        self, agent: Agent, steps: int, report: EvaluationReport
+    ) -> dict[str, Any]:
+        """Write the policy as the best one, with its figures, and return these."""
         path, config = self.folder.best, self.config
+        # The return is of the reward learned from, elsewhere it is of the sparse one.
+        figures = {**report.as_dict(), "reward_mode": config.reward_mode}
         checkpoint.save_policy(path, agent, config, steps=steps, evaluation=figures)
+        return figures
 
     def _fresh_scenes(self) -> State:
         """Start new episodes whose scenes follow from (seed, steps) alone."""
         rank = distributed.rank()
         if rank > 0:
             torch.manual_seed(_entropy(self.config.seed, self.steps, rank))
-        # Half of the seeds, apart from those that evaluations are pinned to.
+        # A quarter of the seeds, beyond those that an `eval_seed` may be.
         seed = 2**30 + _entropy(self.config.seed, self.steps) % 2**29
         obs, _ = self.envs.reset(seed=seed + rank * self.envs.num_envs)
         self.reward_scale.restart()
@@ -339,9 +390,11 @@ class Trainer:
         before = self.steps - self.config.steps_per_update
         return self.steps // interval > before // interval
 
-    def _reached(self, evaluation: dict[str, float]) -> bool:
-        goal = self.config.stop_at_success
-        return goal is not None and evaluation["eval/worst"] >= goal
+    def _evaluation_is_due(self, total: int) -> bool:
+        """Whether a multiple of the interval, or the end, is not evaluated yet."""
+        interval = self.config.eval_interval
+        passed = self.steps // interval > self.evaluated // interval
+        return passed or (self.steps >= total and self.steps > self.evaluated)
 
 
 def _figures(report: EvaluationReport) -> dict[str, float]:
