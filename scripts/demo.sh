@@ -14,13 +14,13 @@ finished=$folder/evaluation.json
 if [ -f "$finished" ] && [ -f "$best" ]; then
     echo "A finished run of $task is in $folder (remove it to train anew)."
 else
-    echo "Training on $task from camera images: about 6 minutes on two CPU cores, less on"
-    echo "more. Ctrl-C is safe: the next 'make demo' goes on from the last checkpoint."
+    echo "Training on $task from camera images (README.md says how long that takes)."
+    echo "Ctrl-C is safe: the next 'make demo' goes on from the last checkpoint."
     "$ir" train "$task" --out "$folder" --agent.senses vision --resume
 fi
 
 echo
-echo "Evaluating on $episodes pinned episodes that training never saw (about a minute) ..."
+echo "Evaluating on $episodes pinned episodes that training never saw ..."
 "$ir" evaluate "$task" --checkpoint "$best" --episodes "$episodes" --json "$folder/report.json"
 
 echo
