@@ -18,6 +18,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 import ir_maniskill  # noqa: F401 - registers the tasks
 from ir_maniskill import experiment as catalog
+from ir_maniskill.environment.state import CAMERAS
 from ir_maniskill.training.checkpoint import load_policy
 from ir_maniskill.training.video import record, write_video
 
@@ -33,6 +34,7 @@ FILMS = (
     "NaoTouchCubeTriangle-v1",
     "NaoTouchCubeShuffled-v1",
     "NaoTouchButtonMulti-v1",
+    "NaoTouchButtonTriangle-v1",
 )
 """The tasks of which there is a film."""
 SCENE = 2_000_000
@@ -59,7 +61,7 @@ def shoot(task: str, size: tuple[int, int]) -> tuple[Image.Image, list[Image.Ima
     view = Image.fromarray(env.render()[0].cpu().numpy()).resize(size)
     eyes = [
         Image.fromarray(obs["sensor_data"][name]["rgb"][0].cpu().numpy())
-        for name in ("top_camera", "front_camera")
+        for name in CAMERAS
     ]
     env.close()
     return view, eyes

@@ -4,6 +4,7 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 
+from ir_maniskill.environment.robot.nao import FINGERS
 from ir_maniskill.training import plots, video
 from ir_maniskill.training.evaluate import evaluate_policy
 from ir_maniskill.training.video import RIGHT, SIZE, WRONG, Snapshot, draw, write_video
@@ -16,6 +17,7 @@ def snapshot(step=3, right=(), wrong=(), history=((False, False),) * 3):
         view=gray,
         cameras=(picture, picture),
         instruction="Touch the blue cube.",
+        fingers=FINGERS,
         right=tuple(finger in right for finger in range(6)),
         wrong=tuple(finger in wrong for finger in range(6)),
         step=step,
@@ -53,6 +55,21 @@ def test_a_touching_finger_lights_its_own_lamp_only(finger):
         assert lit == [other == finger for other in range(6)]
 
 
+def lit(count, names):
+    """Return the share of the lights' card that is green if `count` fingers touch."""
+    right = tuple(index < count for index in range(len(names)))
+    shown = {"fingers": names, "right": right, "wrong": (False,) * len(names)}
+    frame = draw(Snapshot(**{**vars(snapshot()), **shown}))
+    return share(frame, video.HANDS, RIGHT)
+
+
+def test_another_robot_has_as_many_lights_as_fingers():
+    one = lit(1, ("tip",))
+    assert one > 0.005
+    assert lit(8, tuple("abcdefgh")) == pytest.approx(8 * one)
+    assert lit(0, ("tip",)) == 0
+
+
 def test_the_timeline_shows_what_each_step_touched():
     history = ((True, False), (False, True), (True, True))
     frame = draw(snapshot(history=history))
@@ -64,13 +81,13 @@ def test_the_timeline_shows_what_each_step_touched():
 def test_the_view_and_the_pictures_are_shown():
     frame = draw(snapshot())
     assert share(frame, video.VIEW, (127, 127, 127)) > 0.99
-    for box in video.CAMERAS:
+    for box in video.PICTURES:
         assert share(frame, box, (200, 200, 200)) > 0.98
 
 
 def test_a_policy_without_pictures_can_be_shown():
     blind = draw(Snapshot(**{**vars(snapshot()), "cameras": ()}))
-    assert share(blind, video.CAMERAS[0], video.PAGE) == 1
+    assert share(blind, video.PICTURES[0], video.PAGE) == 1
 
 
 @pytest.mark.parametrize("name, size", [("a.mp4", (1280, 720)), ("a.gif", (640, 360))])

@@ -7,6 +7,7 @@ and the counters.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -20,7 +21,9 @@ import torch
 from mani_skill.utils.sapien_utils import look_at
 from PIL import Image, ImageDraw, ImageFont
 
-from ir_maniskill.environment.state import StateStack
+from ir_maniskill.environment.reward_generator import split_fingers
+from ir_maniskill.environment.state import CAMERAS, StateStack
+from ir_maniskill.environment.touch_env import CONTROL_FREQ
 from ir_maniskill.training.evaluate import Policy, one_thread
 
 Box = tuple[int, int, int, int]
@@ -33,7 +36,7 @@ VIEW: Box = (32, 100, 836, 540)
 """The human view."""
 TIMELINE: Box = (32, 664, 836, 24)
 """One cell for each step, below the human view."""
-CAMERAS: tuple[Box, Box] = ((900, 124, 166, 332), (1082, 124, 166, 332))
+PICTURES: tuple[Box, Box] = ((900, 124, 166, 332), (1082, 124, 166, 332))
 """The policy's top and front pictures."""
 HANDS: Box = (900, 480, 348, 128)
 """The touch lights."""
@@ -51,14 +54,10 @@ DIM: Color = (88, 94, 105)
 RIGHT: Color = (64, 210, 128)
 WRONG: Color = (242, 84, 84)
 
-FINGERS = ("Finger 1", "Finger 2", "Thumb")
-"""Fingers of each hand, in the order of the environment."""
 VIEWPOINT = ((0.80, 0.30, 0.40), (0.08, 0.0, 0.09))
 """Eye and target of the human view [m]."""
 SHARPNESS = 1.5
 """How much larger the human view is rendered than shown, for smooth edges."""
-STEP_RATE = 20.0
-"""Control steps a second [1/s]."""
 
 
 @dataclass(frozen=True)
@@ -71,10 +70,12 @@ class Snapshot:
     """The policy's pictures, top and front, each [h, w, 3] uint8."""
     instruction: str
     """The sentence."""
+    fingers: tuple[str, ...]
+    """Names of the robot's F fingers."""
     right: tuple[bool, ...]
-    """Which of the six fingers are on the named object."""
+    """Which of the F fingers are on the named object."""
     wrong: tuple[bool, ...]
-    """Which of the six fingers are on another."""
+    """Which of the F fingers are on another."""
     step: int
     """Steps since the episode began."""
     total_steps: int
@@ -155,14 +156,14 @@ class _Stage:
         self._env.close()
 
 
-@torch.inference_mode()
+@torch.no_grad()  # no inference mode: what the env keeps must stay changeable
 def _play(
     policy: Policy, env: gym.Env, obs: Any, stack: StateStack, stage: _Stage
 ) -> Iterator[Snapshot]:
     """Plays the episode that a reset has begun."""
     base: Any = env.unwrapped
     state, total = stack.reset(obs), base.experiment.episode_steps
-    right = wrong = (False,) * (2 * len(FINGERS))
+    right = wrong = [False] * len(base.agent.fingers)
     score = 0.0
     history: tuple[tuple[bool, bool], ...] = ()
     for step in range(total + 1):
@@ -170,8 +171,9 @@ def _play(
             view=stage.show(base.get_state_dict()),
             cameras=_camera_pictures(obs),
             instruction=base.get_language_instruction()[0],
-            right=right,
-            wrong=wrong,
+            fingers=base.agent.fingers,
+            right=tuple(right),
+            wrong=tuple(wrong),
             step=step,
             total_steps=total,
             score=score,
@@ -182,18 +184,9 @@ def _play(
                 action = policy(state)
             obs, reward, _, _, info = env.step(action)
             state, score = stack.push(obs), score + float(reward)
-            right, wrong = _touching(info["contact"][0], int(base.target_index[0]))
+            split = split_fingers(info["contact"], base.named)
+            right, wrong = (fingers[0].tolist() for fingers in split)
             history += ((any(right), any(wrong)),)
-
-
-def _touching(
-    contact: torch.Tensor, target: int
-) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
-    """Splits contacts [F, C] into fingers on the named object and on another."""
-    right = contact[:, target]
-    others = contact.clone()
-    others[:, target] = False
-    return tuple(right.tolist()), tuple(others.any(dim=1).tolist())
 
 
 def _picture(tensor: Any) -> np.ndarray:
@@ -204,8 +197,7 @@ def _picture(tensor: Any) -> np.ndarray:
 
 def _camera_pictures(obs: dict[str, Any]) -> tuple[np.ndarray, ...]:
     sensors = obs.get("sensor_data", {})
-    names = ("top_camera", "front_camera")
-    return tuple(_picture(sensors[name]["rgb"]) for name in names if name in sensors)
+    return tuple(_picture(sensors[name]["rgb"]) for name in CAMERAS if name in sensors)
 
 
 # -- Drawing -------------------------------------------------------------------------
@@ -215,7 +207,7 @@ def draw(snapshot: Snapshot) -> np.ndarray:
     """Draws a frame [720, 1280, 3] uint8."""
     page = _page().copy()
     _paste(page, snapshot.view, VIEW, radius=14)
-    for picture, box in zip(snapshot.cameras, CAMERAS, strict=False):
+    for picture, box in zip(snapshot.cameras, PICTURES, strict=False):
         _paste(page, picture, box, radius=10)
     canvas = ImageDraw.Draw(page)
     canvas.text((32, 46), snapshot.instruction, INK, _font(34))
@@ -248,11 +240,11 @@ def _page() -> Image.Image:
 
 
 def _label_cameras(canvas: ImageDraw.ImageDraw, pictures: Sequence[np.ndarray]) -> None:
-    names = ("TOP CAMERA", "FRONT CAMERA")
-    for name, picture, (x, y, width, _) in zip(names, pictures, CAMERAS, strict=False):
-        height_px, width_px = picture.shape[:2]
+    for camera, picture, box in zip(CAMERAS, pictures, PICTURES, strict=False):
+        x, y, width, _ = box
+        name = camera.replace("_", " ").upper()
         canvas.text((x + 1, y - 10), name, FAINT, _font(12), anchor="ls")
-        size = f"{width_px} x {height_px}"
+        size = "{} x {}".format(*picture.shape)  # height x width
         canvas.text((x + width, y - 10), size, DIM, _font(12), anchor="rs")
 
 
@@ -308,24 +300,43 @@ def _draw_timeline(canvas: ImageDraw.ImageDraw, snapshot: Snapshot) -> None:
 
 
 def _draw_hands(page: Image.Image, snapshot: Snapshot) -> None:
-    """A row of lights for each hand; the robot's left hand first."""
+    """A row of lights for each hand, in the order of the robot's fingers."""
     x, y, _, _ = HANDS
     canvas = ImageDraw.Draw(page)
-    for hand, title in enumerate(("LEFT", "RIGHT")):
-        top = y + 14 + 56 * hand
-        canvas.text((x + 18, top + 14), title, FAINT, _font(13))
-        for finger, name in enumerate(FINGERS):
-            index, left = 3 * hand + finger, x + 84 + 88 * finger
-            color = EDGE
-            if snapshot.right[index]:
-                color = RIGHT
-            if snapshot.wrong[index]:
-                color = WRONG
-            if color != EDGE:
-                _paste_shape(page, (left + 14, top - 5, 32, 32), _dim(color), 16)
-            _paste_shape(page, (left + 20, top + 1, 20, 20), color, 10)
-            ink = INK if color != EDGE else FAINT
-            canvas.text((left + 30, top + 29), name, ink, _font(12), anchor="mt")
+    hands: dict[str, list[tuple[str, Color]]] = {}
+    touches = zip(snapshot.fingers, snapshot.right, snapshot.wrong, strict=True)
+    for finger, right, wrong in touches:
+        hand, name = _titles(finger)
+        color = WRONG if wrong else RIGHT if right else EDGE
+        hands.setdefault(hand, []).append((name, color))
+    for row, (hand, lights) in enumerate(hands.items()):
+        top = y + 14 + row * min(56, 112 // len(hands))
+        canvas.text((x + 18, top + 14), hand, FAINT, _font(13))
+        for column, (name, color) in enumerate(lights):
+            left = x + 84 + column * min(88, 218 // max(len(lights) - 1, 1))
+            _draw_light(page, (left, top), name, color)
+
+
+def _titles(finger: str) -> tuple[str, str]:
+    """Splits "LFinger1" into "LEFT" and "Finger 1"; other names have no hand."""
+    parts = re.fullmatch(r"([LR])([A-Z][a-z]+)(\d*)", finger)
+    if parts is None:
+        return "", finger
+    side, name, number = parts.groups()
+    return {"L": "LEFT", "R": "RIGHT"}[side], f"{name} {number}".strip()
+
+
+def _draw_light(
+    page: Image.Image, place: tuple[int, int], name: str, color: Color
+) -> None:
+    """A light with its name; it glows unless its color is that of an edge."""
+    left, top = place
+    if color != EDGE:
+        _paste_shape(page, (left + 14, top - 5, 32, 32), _dim(color), 16)
+    _paste_shape(page, (left + 20, top + 1, 20, 20), color, 10)
+    ink = INK if color != EDGE else FAINT
+    text = (left + 30, top + 29)
+    ImageDraw.Draw(page).text(text, name, ink, _font(12), anchor="mt")
 
 
 def _dim(color: Color) -> Color:
@@ -336,7 +347,7 @@ def _dim(color: Color) -> Color:
 
 def _draw_counters(canvas: ImageDraw.ImageDraw, snapshot: Snapshot) -> None:
     x, y, width, _ = COUNTERS
-    seconds = snapshot.step / STEP_RATE
+    seconds = snapshot.step / CONTROL_FREQ
     columns = (
         ("STEP", f"{snapshot.step} / {snapshot.total_steps}"),
         ("TIME", f"{seconds:.2f} s"),
@@ -370,7 +381,7 @@ def write_video(
     """
     check_name(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    rate = STEP_RATE * speed
+    rate = CONTROL_FREQ * speed
     count = 0
 
     def frames() -> Iterator[np.ndarray]:
