@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import gymnasium as gym
 from mani_skill.utils.registration import REGISTERED_ENVS, register_env
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.touch_env import TouchEnv
-from ir_maniskill.experiment import Experiment
+from ir_maniskill.experiment import Experiment, ExperimentError
 
 
 def register(experiment: Experiment) -> Experiment:
@@ -18,8 +19,14 @@ def register(experiment: Experiment) -> Experiment:
         The experiment itself, so that a task file reads `TASK = register(...)`.
 
     Raises:
-        ExperimentError: Another experiment has that id already.
+        ExperimentError: Another experiment, or a task of another package, has that id
+            already.
     """
+    if experiment.id in gym.registry and experiment.id not in catalog.available():
+        raise ExperimentError(
+            f"experiment id: got {experiment.id!r}, which is taken by another package; "
+            "register yours under another id"
+        )
     catalog.add(experiment)
     if experiment.id not in REGISTERED_ENVS:
         register_env(

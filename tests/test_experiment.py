@@ -83,6 +83,13 @@ def test_an_id_cannot_be_taken_twice() -> None:
         catalog.add(dataclasses.replace(single, episode_steps=64))
 
 
+@pytest.mark.parametrize("task_id", ["PickCube-v1", "CartPole-v1"])
+def test_an_id_of_another_package_is_taken(task_id: str) -> None:
+    with pytest.raises(ExperimentError, match=f"got '{task_id}', which is taken"):
+        ir_maniskill.register(make(id=task_id))
+    assert task_id not in ir_maniskill.available()
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

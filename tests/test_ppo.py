@@ -14,6 +14,7 @@ from ir_maniskill.training.config import PPOConfig
 from ir_maniskill.training.finite import TrainingDivergedError, check_finite
 from ir_maniskill.training.rollout import (
     Batch,
+    EpisodeSums,
     RewardScale,
     Rollout,
     advantages,
@@ -157,6 +158,12 @@ def batch_of(advantage, returns=(0.0, 0.0), **state):
     return Batch(state, torch.zeros(size, 1), torch.zeros(size), *rows)
 
 
+def test_where_no_episode_ended_there_are_no_figures_of_episodes():
+    means = EpisodeSums(steps=4, reward=2.0, touching=1).means()
+    assert (means["reward"], means["touching"]) == (0.5, 0.25)
+    assert all(math.isnan(means[name]) for name in ("return", "success", "exclusive"))
+
+
 def test_policy_loss_is_clipped_by_hand():
     agent = judged([math.log(1.5), math.log(0.5)], value=[0.0, 0.0])
     _, terms = ppo.ppo_loss(agent, batch_of([1.0, -1.0]), PPOConfig(clip=0.2))
@@ -223,6 +230,13 @@ def test_the_step_size_stays_within_its_bounds():
         for _ in range(20):
             ppo.adapt_rate(optimizer, kl, 0.015)
         assert optimizer.param_groups[0]["lr"] == bound
+
+
+@pytest.mark.parametrize(("kl", "rate"), [(0.0, 3e-3), (1.0, 3e-6)])
+def test_a_step_size_beyond_its_bounds_never_changes_the_wrong_way(kl, rate):
+    optimizer = torch.optim.Adam([torch.zeros(1, requires_grad=True)], rate)
+    ppo.adapt_rate(optimizer, kl, 0.015)
+    assert optimizer.param_groups[0]["lr"] == rate
 
 
 def test_the_gradient_is_cut_to_its_longest_length():

@@ -131,7 +131,8 @@ class PPOConfig:
     """No further epoch once the policy moved this far [nat]; None: all epochs."""
     target_kl: float | None = 0.015
     """How far an epoch should find the policy moved [nat]: Adam's step size shrinks
-    where it is twice as far, and grows where it is half; None: it stays."""
+    where it is twice as far, to 1e-5 at least, and grows where it is half, to 1e-3 at
+    most; None: it stays."""
     max_grad_norm: float | None = 0.5
     """Longest gradient; None: any."""
     normalize_reward: bool = True

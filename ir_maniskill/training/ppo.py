@@ -18,7 +18,7 @@ DECIMETER = 0.1
 RATE_CHANGE = 1.5
 """Factor by which the step size changes, at most once an epoch."""
 LOWEST_RATE, HIGHEST_RATE = 1e-5, 1e-3
-"""Between which the step size stays if it changes."""
+"""Up to which the step size shrinks and grows."""
 
 
 def update(
@@ -55,14 +55,18 @@ def update(
 def adapt_rate(
     optimizer: torch.optim.Optimizer, kl: float, target: float | None
 ) -> None:
-    """Change the step size if an epoch moved the policy too far, or hardly."""
+    """Change the step size if an epoch moved the policy too far, or hardly.
+
+    One that is beyond a bound from the start stays there rather than jump to it.
+    """
     if target is None:
         return
     for group in optimizer.param_groups:
+        rate = group["lr"]
         if kl > 2 * target:
-            group["lr"] = max(group["lr"] / RATE_CHANGE, LOWEST_RATE)
+            group["lr"] = min(rate, max(rate / RATE_CHANGE, LOWEST_RATE))
         elif kl < target / 2:
-            group["lr"] = min(group["lr"] * RATE_CHANGE, HIGHEST_RATE)
+            group["lr"] = max(rate, min(rate * RATE_CHANGE, HIGHEST_RATE))
 
 
 def minibatches(rollout: Rollout, config: PPOConfig) -> Iterator[Tensor]:

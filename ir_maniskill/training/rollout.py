@@ -1,5 +1,6 @@
 """Roll-outs: what the agent lived through, kept for one update."""
 
+import math
 from dataclasses import astuple, dataclass
 from typing import Any
 
@@ -240,8 +241,8 @@ class EpisodeSums:
         return EpisodeSums(*distributed.gather(sums[None]).sum(dim=0).tolist())
 
     def means(self) -> dict[str, float]:
-        """Return the figures per step and per episode."""
-        episodes = max(self.episodes, 1)
+        """Return the figures per step and per episode; NaN of none that ended."""
+        episodes = self.episodes or math.nan
         return {
             "return": self.reward / episodes,
             "reward": self.reward / self.steps,
@@ -284,7 +285,7 @@ def collect(
         if config.bootstrap and truncated.any():
             final = to(stack.peek(info["final_observation"]), device)
             cut = values_of(agent, final, truncated & ~terminated)
-        outcome = {"reward": reward, "value of the last observation": cut}
+        outcome = {"reward": reward.to(device), "value of the last observation": cut}
         check_finite(outcome, "outcome", "the simulation became unstable")
         rollout.add_outcome(t, reward, done, cut)
         sums.add(reward, done, info.get("final_info", info))
