@@ -68,9 +68,9 @@ preset was trained."""
 ONE_SETTING = """\
 ## What one setting changes
 
-Runs that differ from the preset `default` in one field, beside the preset itself: the
-worst sentence of the worst seed in the end, and exclusive success of both in the
-choosing evaluations after equally many steps."""
+Runs that differ from the preset `default` in one field, beside the preset itself: each
+figure in the end is the lowest over sentences and seeds; then exclusive success of both
+in the choosing evaluations after equally many steps."""
 
 OBEYS = 0.95
 """Share of exclusive episodes from which a way of learning counts as successful."""
@@ -425,9 +425,9 @@ def fingers_table(
             max(goal["right_fingers"] for goal in goals.values())
             for goals in oracle.get(task, {}).get("instructions", {}).values()
         ]
-        part = f" ({len(found)} of {len(ours)} sentences)" if found else ""
-        bound = _mean(found) + (part if len(found) < len(ours) else "")
-        rows.append((f"`{task}`", f"{level:g}", _mean(ours), bound))
+        some = 0 < len(found) < len(ours)
+        part = f" ({len(found)} of {len(ours)} sentences)" if some else ""
+        rows.append((f"`{task}`", f"{level:g}", _mean(ours), _mean(found) + part))
     return table(head, rows)
 
 

@@ -87,12 +87,11 @@ def test_a_label_is_the_nearest_preset_and_what_differs():
     assert run.label == "`default`, agent.senses vision+touch, reward_mode sparse"
 
 
-NEEDLESS = dict.fromkeys(["env_id", "out", *("num_workers", "threads")])
-NEEDLESS |= {"checkpoint_interval": 1}
+NEEDLESS = dict.fromkeys(results.UNCOPIED)
 
 
 def trained_by(command):
-    """The config that a command of the page trains, but for the machine's part."""
+    """The config that a command of the page trains, but for what it need not name."""
     config = json.loads(to_json(cli.parse(command.split()[1:]).config))
     return config | NEEDLESS
 
