@@ -103,6 +103,21 @@ def test_videos_play_and_hold_their_last_frame(name, size, tmp_path):
     assert not np.array_equal(frames[0], frames[4])
 
 
+def test_a_gif_keeps_the_colors_of_small_things(tmp_path):
+    blue, red, x = (40, 90, 220), (200, 40, 40), 460
+    shade = np.linspace((40, 60, 90), (220, 210, 200), 836).astype(np.uint8)
+    shots = []
+    for step, color in enumerate((blue, blue, blue, red)):
+        view = np.tile(shade, (540, 1, 1))
+        view[240:280, x : x + 40] = color
+        shots.append(Snapshot(**{**vars(snapshot(step=step)), "view": view}))
+    write_video(tmp_path / "a.gif", shots)
+    frames = list(imageio.get_reader(tmp_path / "a.gif"))
+    at = (video.VIEW[1] + 260) // 2, (video.VIEW[0] + x + 20) // 2
+    for frame, color in ((frames[0], blue), (frames[-1], red)):
+        assert np.abs(np.asarray(frame)[at][:3].astype(int) - color).max() < 12
+
+
 def test_mp4_uses_the_colors_every_player_knows(tmp_path):
     path = tmp_path / "a.mp4"
     write_video(path, [snapshot()])

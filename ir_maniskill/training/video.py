@@ -423,6 +423,19 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
             writer.append_data(frame)
 
 
+def _palette(images: Sequence[Image.Image]) -> Image.Image:
+    """Chooses colors for a film by some of its frames.
+
+    The octree keeps small things of a color of their own, such as a cube, apart; the
+    median cut merges them into what is large.
+    """
+    width, height = images[0].size
+    montage = Image.new("RGB", (width, height * len(images)))
+    for index, image in enumerate(images):
+        montage.paste(image, (0, height * index))
+    return montage.quantize(128, method=Image.Quantize.FASTOCTREE)
+
+
 def _write_gif(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
     """Half the size, and one palette for all frames, to stay small."""
     size = (SIZE[0] // 2, SIZE[1] // 2)
@@ -432,7 +445,7 @@ def _write_gif(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
     ]
     if not images:
         return
-    palette = images[len(images) // 2].quantize(128)
+    palette = _palette([images[0], images[len(images) // 2], images[-1]])
     images = [
         image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images
     ]
