@@ -20,6 +20,7 @@ import ir_maniskill  # noqa: F401 - registers the tasks
 from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.state import CAMERAS
 from ir_maniskill.training.checkpoint import load_policy
+from ir_maniskill.training.evaluate import EVALUATION_SEED
 from ir_maniskill.training.video import record, write_video
 
 FOLDER = Path(__file__).parent / "images"
@@ -37,8 +38,6 @@ FILMS = (
     "NaoTouchButtonTriangle-v1",
 )
 """The tasks of which there is a film."""
-SCENE = 2_000_000
-"""Seed of the films' scenes: the first of an evaluation."""
 
 
 def shoot(task: str, size: tuple[int, int]) -> tuple[Image.Image, list[Image.Image]]:
@@ -116,7 +115,7 @@ def film(task: str, path: Path) -> None:
     play = partial(
         *(record, agent.policy, task),
         episodes=1,
-        seed=SCENE,
+        seed=EVALUATION_SEED,
         frames=config.frames,
         env_kwargs=config.env_kwargs(training=False),
     )

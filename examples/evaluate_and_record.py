@@ -15,7 +15,11 @@ from torch import Tensor
 
 from ir_maniskill.training.checkpoint import load_policy
 from ir_maniskill.training.config import CONFIGS
-from ir_maniskill.training.evaluate import evaluate_policy, write_report
+from ir_maniskill.training.evaluate import (
+    EVALUATION_SEED,
+    evaluate_policy,
+    write_report,
+)
 from ir_maniskill.training.video import record, write_video
 
 
@@ -37,7 +41,7 @@ def main(
         agent, config, _ = load_policy(checkpoint)
         policy, task = agent.policy, config.env_id
     env_kwargs = config.env_kwargs(training=False)
-    seed, frames = 2_000_000, config.frames
+    seed, frames = EVALUATION_SEED, config.frames
     report = evaluate_policy(
         policy,
         task,

@@ -23,7 +23,11 @@ from ir_maniskill.experiment import Experiment
 from ir_maniskill.training import distributed, plots, video
 from ir_maniskill.training.checkpoint import load_policy, writing
 from ir_maniskill.training.config import CONFIGS, TrainConfig
-from ir_maniskill.training.evaluate import evaluate_policy, write_report
+from ir_maniskill.training.evaluate import (
+    EVALUATION_SEED,
+    evaluate_policy,
+    write_report,
+)
 from ir_maniskill.training.train import train
 
 TaskId = Positional[Annotated[str, arg(metavar="ID")]]
@@ -71,7 +75,7 @@ class Evaluate:
     """Accept a policy that was trained for another task."""
     episodes: int = 100
     """Episodes, spread evenly over the instructions."""
-    seed: int = 2_000_000
+    seed: int = EVALUATION_SEED
     """Seed of the first episode; episode e starts from seed + e."""
     num_envs: int = 8
     """Scenes simulated side by side; on a CPU the result is the same for any number."""
@@ -95,7 +99,7 @@ class Video:
     """File to write; None: runs/ID.mp4."""
     episodes: int = 3
     """Episodes; the instructions take turns."""
-    seed: int = 2_000_000
+    seed: int = EVALUATION_SEED
     """Seed of the first episode; episode e starts from seed + e."""
     speed: float = 0.5
     """How fast to play; 1 is real time."""
@@ -247,6 +251,7 @@ def _evaluate(command: Evaluate) -> int:
     agent, config, facts = _load(path, task, command.any_task)
     if command.json is not None:
         _require_writable(command.json)
+    kwargs = config.env_kwargs(training=False)
     report = evaluate_policy(
         agent.policy,
         task.id,
@@ -254,15 +259,20 @@ def _evaluate(command: Evaluate) -> int:
         seed=command.seed,
         num_envs=command.num_envs,
         frames=config.frames,
-        env_kwargs=config.env_kwargs(training=False),
+        env_kwargs=kwargs,
         instructions=chosen,
         progress=True,
     )
     print(report)
     if command.json is not None:
-        about = {"checkpoint": str(path), "trained_steps": facts.get("steps")}
-        settings = dataclasses.asdict(config)
-        write_report(command.json, report, **about, config=settings)
+        write_report(
+            command.json,
+            report,
+            reward_mode=kwargs["reward_mode"],
+            checkpoint=str(path),
+            trained_steps=facts.get("steps"),
+            config=dataclasses.asdict(config),
+        )
     return 0
 
 

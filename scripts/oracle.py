@@ -40,11 +40,9 @@ from ir_maniskill.environment.robot.nao import (
     HAND,
     JOINTS,
 )
-from ir_maniskill.training.evaluate import versions
+from ir_maniskill.training.evaluate import EVALUATION_SEED, versions
 
 OUT = Path(__file__).parent.parent / "docs" / "results" / "oracle.json"
-SEED = 2_000_000
-"""Seed of the first scene: those of `ir-maniskill evaluate`."""
 DELTA = np.array([(HAND if j[1:] in FINGER_JOINTS else ARM).delta for j in JOINTS])
 """Largest change of each joint's target in a step [half the joint's range]."""
 PLAN = 2 * len(JOINTS) + 1
@@ -433,7 +431,7 @@ def measure(
     stage, count = Stage(env_id), len(sentences)
     figures: dict[str, dict[Goal, dict[str, Any]]] = {}
     for index, sentence in enumerate(sentences):
-        seeds = [SEED + index + count * scene for scene in range(scenes)]
+        seeds = [EVALUATION_SEED + index + count * scene for scene in range(scenes)]
         figures[sentence] = {}
         for goal in GOALS:
             found = explore(stage, index, seeds, goal, known)
@@ -461,7 +459,11 @@ def main() -> None:
     for task in given.tasks:
         known = [] if given.anew else plans_of(data)
         for figures in measure(task, given.scenes, known):
-            data[task] = {"seed": SEED, "versions": versions(), "instructions": figures}
+            data[task] = {
+                "seed": EVALUATION_SEED,
+                "versions": versions(),
+                "instructions": figures,
+            }
             given.out.parent.mkdir(parents=True, exist_ok=True)
             given.out.write_text(json.dumps(data, indent=1) + "\n")
 

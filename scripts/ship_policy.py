@@ -11,6 +11,7 @@ import argparse
 import dataclasses
 import json
 import subprocess
+import tempfile
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,14 +19,13 @@ from typing import Any
 from ir_maniskill import experiment as catalog
 from ir_maniskill.training import checkpoint
 from ir_maniskill.training.evaluate import (
+    EVALUATION_SEED,
     EvaluationReport,
     evaluate_policy,
     evaluate_scenes,
 )
 
 FOLDER = Path(__file__).parent.parent / "assets" / "policies"
-SEED = 2_000_000
-"""Seed of the first episode, apart from those of training and of choosing."""
 
 
 def ship(run: Path, episodes: int, scenes: int) -> EvaluationReport:
@@ -38,15 +38,15 @@ def ship(run: Path, episodes: int, scenes: int) -> EvaluationReport:
     """
     agent, config, facts = checkpoint.load_policy(run / "best.safetensors")
     config = dataclasses.replace(config, out=f"runs/{config.env_id}")
-    path = FOLDER / f"{config.env_id}.safetensors"
-    path.parent.mkdir(exist_ok=True)
     origin = {"steps": facts["steps"], "half": True}
-    save = partial(checkpoint.save_policy, path, agent, config, **origin)
-    save(evaluation={})
-    rounded, *_ = checkpoint.load_policy(path)
+    save = partial(checkpoint.save_policy, agent=agent, config=config, **origin)
+    with tempfile.TemporaryDirectory() as folder:
+        draft = Path(folder) / "rounded.safetensors"
+        save(draft, evaluation={})
+        rounded, *_ = checkpoint.load_policy(draft)
     sentences = len(catalog.get(config.env_id).sentences)
     play: dict[str, Any] = {
-        "seed": SEED,
+        "seed": EVALUATION_SEED,
         "frames": config.frames,
         "env_kwargs": config.env_kwargs(training=False),
         "progress": True,
@@ -58,7 +58,9 @@ def ship(run: Path, episodes: int, scenes: int) -> EvaluationReport:
     if sentences > 1:
         same = evaluate_scenes(rounded.policy, config.env_id, scenes=scenes, **play)
         figures["same_scene"] = {"scenes": scenes, **same.as_dict()}
-    save(evaluation=figures)
+    path = FOLDER / f"{config.env_id}.safetensors"
+    path.parent.mkdir(exist_ok=True)
+    save(path, evaluation=figures)
     about = {"run": run.resolve().name, "steps": facts["steps"]}
     about["training_seed"] = config.seed
     path.with_suffix(".json").write_text(

@@ -1,6 +1,7 @@
 import contextlib
 import json
 import math
+import platform
 from types import SimpleNamespace
 
 import pytest
@@ -183,6 +184,7 @@ def test_report_is_written_as_json_with_versions_and_machine(tmp_path):
     assert data["instructions"][SENTENCES[1]]["success_interval"][0] == 0
     assert data["seed"] == 0 and data["checkpoint"] == "best.safetensors"
     assert data["versions"]["sapien"].startswith("3.") and data["machine"]["cpus"] >= 1
+    assert data["machine"]["platform"] == f"{platform.system()} {platform.machine()}"
 
 
 def test_table_has_a_row_for_each_instruction_and_one_for_all():

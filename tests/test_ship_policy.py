@@ -23,19 +23,37 @@ def fake_scenes(policy, env_id, *, scenes, seed, **_):
     return SceneReport(env_id, seed, Rate(scenes - 1, scenes), {})
 
 
+def make_run(folder, task):
+    """Write the best policy of a run."""
+    config = dataclasses.replace(toy_config(folder), env_id=task, seed=5)
+    agent = Agent(config.agent, StateSpec(2, 3, 0, 0, 0, 2, 2, 7, 2))
+    folder.mkdir()
+    path = folder / "best.safetensors"
+    checkpoint.save_policy(path, agent, config, steps=4096, evaluation={})
+    return folder
+
+
+def test_what_shipped_before_stays_until_the_new_policy_is_evaluated(
+    tmp_path, monkeypatch
+):
+    def fail(*_, **__):
+        assert (tmp_path / f"{TASK[1]}.safetensors").read_bytes() == b"old"
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ship_policy, "FOLDER", tmp_path)
+    monkeypatch.setattr(ship_policy, "evaluate_policy", fail)
+    (tmp_path / f"{TASK[1]}.safetensors").write_bytes(b"old")
+    with pytest.raises(KeyboardInterrupt):
+        ship_policy.ship(make_run(tmp_path / "run5", TASK[1]), episodes=20, scenes=10)
+
+
 @pytest.mark.parametrize("sentences", [1, 3])
 def test_a_shipped_policy_has_its_figures_and_origin(tmp_path, monkeypatch, sentences):
     monkeypatch.setattr(ship_policy, "FOLDER", tmp_path / "policies")
     monkeypatch.setattr(ship_policy, "_commit", lambda: "0" * 40)
     monkeypatch.setattr(ship_policy, "evaluate_policy", fake_report)
     monkeypatch.setattr(ship_policy, "evaluate_scenes", fake_scenes)
-    config = dataclasses.replace(toy_config(tmp_path), env_id=TASK[sentences], seed=5)
-    run = tmp_path / "run5"
-    run.mkdir()
-    agent = Agent(config.agent, StateSpec(2, 3, 0, 0, 0, 2, 2, 7, 2))
-    checkpoint.save_policy(
-        run / "best.safetensors", agent, config, steps=4096, evaluation={}
-    )
+    run = make_run(tmp_path / "run5", TASK[sentences])
     ship_policy.ship(run, episodes=20, scenes=10)
     stem = tmp_path / "policies" / TASK[sentences]
     data = json.loads(stem.with_suffix(".json").read_text())

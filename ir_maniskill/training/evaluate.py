@@ -32,6 +32,10 @@ Policy = Callable[[dict[str, Tensor]], Tensor]
 """Maps the state s_t of N envs to their actions [N, 26] in [-1, 1]."""
 VectorEnv = GpuVectorEnv | ProcessVectorEnv
 
+EVALUATION_SEED = 2_000_000
+"""Seed of the first episode that figures are made of, apart from those of training and
+of choosing the best policy."""
+
 Z_95 = 1.959963984540054
 """Two-sided 95% quantile of the normal distribution."""
 
@@ -348,7 +352,8 @@ def versions() -> dict[str, str]:
 def machine() -> dict[str, Any]:
     """Returns what the figures were made on."""
     cuda = torch.cuda.get_device_name(0) if torch.cuda.is_available() else None
-    return {"platform": platform.platform(), "cpus": os.cpu_count(), "cuda": cuda}
+    system = f"{platform.system()} {platform.machine()}"
+    return {"platform": system, "cpus": os.cpu_count(), "cuda": cuda}
 
 
 @contextlib.contextmanager
