@@ -273,7 +273,8 @@ class Group:
     @property
     def curve(self) -> Curve:
         """Their learning curve."""
-        return Curve(self.label.replace("`", ""), [r.evaluations for r in self.runs])
+        label = self.label.replace("ppo.target_kl None", "fixed step size")
+        return Curve(label.replace("`", ""), [r.evaluations for r in self.runs])
 
     def after(self, steps: float, column: str) -> float:
         """Return the mean over the seeds of a figure at some step of training."""

@@ -300,6 +300,20 @@ def test_every_seed_has_a_line_of_its_own(tmp_path, monkeypatch):
     assert np.allclose(mean, [1.5, 2.7]) and np.allclose(seeds, [[1, 2], [3.2, 2.2]])
 
 
+def test_mean_and_band_end_with_the_first_seed_that_does(tmp_path, monkeypatch):
+    lines, bands = [], []
+    monkeypatch.setattr(plots.Axes, "plot", lambda _, x, *__, **___: lines.append(x))
+    monkeypatch.setattr(
+        plots.Axes, "fill_between", lambda _, x, *__, **___: bands.append(x)
+    )
+    runs = [make_run(0, fingers=(1.0, 3.2, 3.0)), make_run(1)]
+    curve = plots.Curve("a", [run.evaluations for run in runs])
+    plots.compare([curve], tmp_path / "a.png")
+    mean, seeds = lines[:2]
+    assert mean.tolist() == bands[0].tolist() == [1000, 2000]
+    assert seeds.tolist() == [1000, 2000, 3000]
+
+
 def test_the_band_reaches_from_the_worst_seed_to_the_best(tmp_path, monkeypatch):
     drawn = []
 

@@ -97,8 +97,8 @@ class Curve:
 def compare(curves: Sequence[Curve], out: Path, level: float | None = None) -> Path:
     """Draws ways of learning side by side.
 
-    Each has a line for the mean of its seeds, a band for their range, and a thin line
-    for every seed.
+    Each has a line for the mean of its seeds and a band for their range, as far as all
+    of them reach, and a thin line for every seed.
 
     Args:
         curves: At least one.
@@ -148,11 +148,13 @@ def _draw_range(
 ) -> None:
     steps, values = curve.over_steps(column)
     values = scale * values
+    common = np.isfinite(values).all(axis=0)  # steps that every seed has reached
+    shared = values[:, common]
     seeds = f"{len(curve.runs)} seed{'s' if len(curve.runs) > 1 else ''}"
     label = f"{curve.label} ({seeds})"
-    axes.plot(steps, np.nanmean(values, axis=0), "o-", color=color, ms=3, label=label)
-    low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
-    axes.fill_between(steps, low, high, color=color, alpha=0.18, linewidth=0)
+    mean, low, high = shared.mean(axis=0), shared.min(axis=0), shared.max(axis=0)
+    axes.plot(steps[common], mean, "o-", color=color, ms=3, label=label)
+    axes.fill_between(steps[common], low, high, color=color, alpha=0.18, linewidth=0)
     if len(values) > 1:
         axes.plot(steps, values.T, color=color, linewidth=0.7, alpha=0.6)
 
