@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 import json
 import os
-from collections.abc import Iterable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from tqdm import tqdm
 
@@ -33,8 +33,18 @@ def main() -> None:
     """Measure, write the figures and draw them."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("docs/images/throughput.png"))
-    out = parser.parse_args().out
-    curves = {
+    parser.add_argument("--redraw", action="store_true", help="measure nothing anew")
+    given = parser.parse_args()
+    table = given.out.with_suffix(".json")
+    if not given.redraw:
+        table.parent.mkdir(parents=True, exist_ok=True)
+        table.write_text(json.dumps(measure(), indent=2) + "\n")
+    draw(json.loads(table.read_text()), given.out)
+
+
+def measure() -> dict[str, list[Point]]:
+    """Measure with more and more envs, pixels and objects."""
+    return {
         "envs": [point(str(n), n) for n in tqdm(ENVS, desc="envs")],
         "pictures": [
             point(f"{h} x {w}", 4, height=h, width=w)
@@ -45,9 +55,6 @@ def main() -> None:
             for count in tqdm(OBJECTS, desc="objects")
         ],
     }
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.with_suffix(".json").write_text(json.dumps(curves, indent=2) + "\n")
-    draw(curves, out)
 
 
 def point(
@@ -108,20 +115,19 @@ def draw(curves: dict[str, list[Point]], out: Path) -> None:
     figure, panels = pyplot.subplots(1, len(curves), figsize=(11, 3.2))
     for panel, (name, points) in zip(panels, curves.items(), strict=True):
         labels = [str(p["label"]) for p in points]
-        panel.plot(labels, _relative(points, "steps_per_second"), "o-", label="steps/s")
-        panel.plot(labels, _relative(points, "memory_mb"), "s--", label="memory")
-        panel.set(xlabel=name, ylim=(0, None))
+        speed = np.array([float(p["steps_per_second"]) for p in points])
+        memory = np.array([float(p["memory_mb"]) for p in points])
+        lines = speed / speed[0], memory / memory[0]
+        panel.plot(labels, lines[0], "o-", label="steps/s")
+        panel.plot(labels, lines[1], "s--", label="memory")
+        panel.set(xlabel=name, ylim=(0, 1.1 * np.max(lines)))
+        panel.set_title(f"1 = {speed[0]:.0f} steps/s, {memory[0]:.0f} MB", fontsize=9)
         panel.tick_params(axis="x", labelsize=8)
         panel.grid(alpha=0.3)
     panels[0].set_ylabel("relative to the first point")
     panels[0].legend()
     figure.tight_layout()
     figure.savefig(out, dpi=110)
-
-
-def _relative(points: Iterable[Point], key: str) -> list[float]:
-    values = [float(point[key]) for point in points]
-    return [value / values[0] for value in values]
 
 
 def _memory(process: int) -> float:
