@@ -18,6 +18,7 @@ from PIL import Image
 from toy_envs import ToyVectorEnv, toy_config
 
 from ir_maniskill.agent import Agent, StateSpec
+from ir_maniskill.environment.reward_generator import DenseWeights
 from ir_maniskill.training import checkpoint
 from ir_maniskill.training.checkpoint import CheckpointError, Stored
 from ir_maniskill.training.config import (
@@ -26,7 +27,7 @@ from ir_maniskill.training.config import (
     ConfigError,
     PPOConfig,
     TrainConfig,
-    from_json,
+    decode,
     to_json,
 )
 from ir_maniskill.training.finite import TrainingDivergedError
@@ -59,6 +60,10 @@ def trained(tmp_path):
     return agent, optimizer, config
 
 
+def from_json(text):
+    return decode(TrainConfig, json.loads(text))
+
+
 @pytest.mark.parametrize("name", CONFIGS)
 def test_configs_survive_json(name):
     assert from_json(to_json(CONFIGS[name])) == CONFIGS[name]
@@ -73,6 +78,13 @@ def test_configs_survive_json(name):
         ({"agent": 3}, "AgentConfig: got 3, expected an object"),
         ({"num_envs": 7}, "num_envs: got 7, expected a divisor of 64"),
         ({"stop_at_success": 1.5}, "stop_at_success: got 1.5, expected 0 to 1"),
+        ({"reward_mode": "none"}, "reward_mode: got 'none'.*'dense'"),
+        ({"control_mode": "pd_ee"}, "control_mode: got 'pd_ee'.*'pd_joint_pos'"),
+        ({"eval_seed": 2**29}, "eval_seed: got 536870912, expected 0 to"),
+        (
+            {"dense_weights": dataclasses.asdict(DenseWeights()) | {"spoiled": 1.5}},
+            "dense_weights: got spoiled=1.5",
+        ),
     ],
 )
 def test_wrong_configs_say_what_was_got_and_expected(change, message):
@@ -103,6 +115,7 @@ FIELDS = [
     *((f.name,) for f in dataclasses.fields(TrainConfig)),
     *(("agent", f.name) for f in dataclasses.fields(AgentConfig)),
     *(("ppo", f.name) for f in dataclasses.fields(PPOConfig)),
+    *(("dense_weights", f.name) for f in dataclasses.fields(DenseWeights)),
 ]
 
 
@@ -127,6 +140,8 @@ def test_whatever_a_config_says_it_is_a_config_or_refused(path, value):
         ),
         (lambda: AgentConfig(vision="resnet"), "'patches', 'paper'"),
         (lambda: AgentConfig(language_heads=3), "language_width: got 50.*3 heads"),
+        (lambda: AgentConfig(body_width=0), "body_width: got 0, expected at least 1"),
+        (lambda: TrainConfig(reward_mode="none"), "reward_mode: got 'none', expected"),
         (lambda: AgentConfig(std=0.0), "std: got 0.0, expected more than 0"),
         (lambda: PPOConfig(gamma=1.1), "gamma: got 1.1, expected 0 to 1"),
         (lambda: PPOConfig(minibatch=1), "minibatch: got 1, expected 2 to 2048"),

@@ -229,5 +229,5 @@ def test_evaluate_prints_a_table_and_writes_json(
     assert "Touch the blue cube." in capsys.readouterr().out
     data = json.loads(out.read_text())
     assert data["episodes"] == 3 and data["seed"] == 5 and data["trained_steps"] == 7
-    assert data["config"]["camera_height"] == 64
+    assert (data["config"]["camera_height"], data["reward_mode"]) == (64, "sparse")
     assert list(data["instructions"]) == list(experiment.get(task).sentences)

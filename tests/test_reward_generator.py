@@ -200,6 +200,7 @@ def test_coming_nearer_and_sparing_the_others_never_costs(
         ("wrong", -1.0),
         ("reach", math.nan),
         ("spoiled", math.inf),
+        ("spoiled", 1.5),
     ],
 )
 def test_weights_that_cannot_work_are_refused(name: str, value: float) -> None:

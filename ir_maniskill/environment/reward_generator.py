@@ -79,14 +79,16 @@ class DenseWeights:
         """Check the fields.
 
         Raises:
-            ValueError: A weight is negative or not finite, or a scale is 0.
+            ValueError: A weight is negative or not finite, a scale is 0, or the share
+                `spoiled` is more than 1.
         """
         for name, value in vars(self).items():
-            scale = name.endswith("_scale")
-            if not (0 <= value < math.inf and (value > 0 or not scale)):
+            scale, share = name.endswith("_scale"), name == "spoiled"
+            fits = 0 <= value < math.inf and (value > 0 or not scale)
+            if not fits or (share and value > 1):
                 raise ValueError(
                     f"dense_weights: got {name}={value!r}, expected a finite number of "
-                    "at least 0 (scales: more than 0)"
+                    "at least 0 (scales: more than 0; spoiled: at most 1)"
                 )
 
 

@@ -16,6 +16,8 @@ from ir_maniskill.environment.reward_generator import DenseWeights
 Sense = Literal["vision", "proprioception", "touch", "state"]
 Vision = Literal["patches", "paper"]
 CriticInput = Literal["asymmetric", "separate", "shared"]
+ControlMode = Literal["pd_joint_target_delta_pos", "pd_joint_pos"]
+RewardMode = Literal["dense", "normalized_dense", "sparse"]
 StdMode = Literal["annealed", "fixed", "learned"]
 
 Config = TypeVar("Config")
@@ -86,7 +88,8 @@ class AgentConfig:
         _require_choice("vision", self.vision, Vision)
         _require_choice("critic", self.critic, CriticInput)
         _require_choice("std_mode", self.std_mode, StdMode)
-        for name in ("vocabulary", "language_layers", "language_heads"):
+        positive = "vocabulary language_layers language_heads vision_width body_width"
+        for name in positive.split():
             _require(getattr(self, name) > 0, name, getattr(self, name), "at least 1")
         width, heads = self.language_width, self.language_heads
         fits = width > 0 and width % heads == 0
@@ -175,12 +178,12 @@ class TrainConfig:
     """Simulator processes of each rank on the CPU; None: one a core."""
     threads: int | None = None
     """Threads of each rank's update; None: one a core."""
-    control_mode: str = "pd_joint_target_delta_pos"
+    control_mode: ControlMode = "pd_joint_target_delta_pos"
     """What an action means: "pd_joint_target_delta_pos" moves the joint targets,
     "pd_joint_pos" sets them (the paper's)."""
-    reward_mode: str = "dense"
+    reward_mode: RewardMode = "dense"
     """Reward to learn from: "sparse" is the paper's, "dense" is shaped toward touching
-    the named object alone."""
+    the named object alone, "normalized_dense" is that over the most it can give."""
     dense_weights: DenseWeights = field(default_factory=DenseWeights)
     """What counts how much in the dense reward."""
     shader_pack: str | None = "unlit"
@@ -197,7 +200,7 @@ class TrainConfig:
     eval_episodes: int = 30
     """Episodes of each evaluation, spread evenly over the instructions."""
     eval_seed: int = 1_000_000
-    """Seed of the evaluation's scenes, apart from those of training."""
+    """Seed of the evaluation's scenes; those of training have seeds from 2**30 on."""
     checkpoint_interval: int = 20_000
     """Steps from one complete checkpoint to the next."""
     stop_at_success: float | None = None
@@ -217,9 +220,11 @@ class TrainConfig:
         for name in ("num_workers", "threads"):
             value = getattr(self, name)
             _require(value is None or value > 0, name, value, "at least 1, or None")
-        for name in ("seed", "eval_seed"):
+        _require_choice("control_mode", self.control_mode, ControlMode)
+        _require_choice("reward_mode", self.reward_mode, RewardMode)
+        for name, bits in (("seed", 31), ("eval_seed", 29)):
             value = getattr(self, name)
-            _require(0 <= value < 2**31, name, value, "0 to 2**31 - 1")
+            _require(0 <= value < 2**bits, name, value, f"0 to 2**{bits} - 1")
         rollouts = self.ppo.rollouts
         fits = rollouts % self.num_envs == 0
         _require(fits, "num_envs", self.num_envs, f"a divisor of {rollouts} rollouts")
@@ -309,29 +314,24 @@ def to_json(config: object) -> str:
     return json.dumps(dataclasses.asdict(config), indent=2)  # type: ignore[call-overload]
 
 
-def from_json(text: str) -> TrainConfig:
-    """Return the configuration written by `to_json`, every field checked.
+def decode(cls: type[Config], data: object) -> Config:
+    """Return the dataclass `cls` from plain JSON data, strictly.
 
     Raises:
-        ConfigError: if the text is no JSON, or a field is unknown, missing, of another
-            type than declared, or out of its range.
+        ConfigError: if a field is unknown, missing, of another type than declared, or
+            out of its range.
     """
-    try:
-        data = json.loads(text)
-    except ValueError as error:
-        raise ConfigError(f"configuration: not JSON ({error})") from error
-    return decode(TrainConfig, data)
-
-
-def decode(cls: type[Config], data: object) -> Config:
-    """Return the dataclass `cls` from plain JSON data, strictly."""
     _require(isinstance(data, dict), cls.__name__, data, "an object of its fields")
     values = typing.cast("dict[str, object]", data)
     hints = typing.get_type_hints(cls)
     unknown, missing = sorted(values.keys() - hints), sorted(hints.keys() - values)
     expected = f"exactly its fields (missing: {missing}, unknown: {unknown})"
     _require(not unknown and not missing, cls.__name__, sorted(values), expected)
-    return cls(**{name: _decode(hints[name], values[name], name) for name in hints})
+    fields = {name: _decode(hints[name], values[name], name) for name in hints}
+    try:
+        return cls(**fields)
+    except ValueError as error:  # the environment's classes know no ConfigError
+        raise ConfigError(str(error)) from error
 
 
 def _decode(hint: Any, value: Any, name: str) -> Any:
