@@ -1,7 +1,7 @@
 """What one experiment is: objects, instructions, reward, senses (Sec. III-A, IV).
 
-An `Experiment` is plain data. The environment reads it, nothing else does; a new
-task is a new `Experiment` handed to `ir_maniskill.register`.
+An `Experiment` is plain data; a new task is a new `Experiment` handed to
+`ir_maniskill.register`.
 """
 
 from __future__ import annotations

@@ -23,14 +23,6 @@ ENV_KWARGS = {
 }
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Leave tests marked `gpu` out where torch sees no CUDA device."""
-    if not torch.cuda.is_available():
-        for item in items:
-            if item.get_closest_marker("gpu"):
-                item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
-
-
 @pytest.fixture(scope="session")
 def env_kwargs() -> dict[str, Any]:
     """What the envs below are made with."""

@@ -25,7 +25,7 @@ def make_vec(
     timeout: float = 180.0,
     sim_backend: str = "auto",
     **env_kwargs: Any,
-) -> GpuVectorEnv | ProcessVectorEnv:
+) -> VectorEnv:
     """Make `num_envs` envs that step together.
 
     Args:
@@ -92,3 +92,7 @@ class GpuVectorEnv(ManiSkillVectorEnv):
         if isinstance(seed, int):
             seed = list(range(seed, seed + self.num_envs))
         return super().reset(seed=seed, options=options)
+
+
+VectorEnv = GpuVectorEnv | ProcessVectorEnv
+"""What `make_vec` makes."""

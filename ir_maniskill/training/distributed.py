@@ -72,12 +72,8 @@ def device() -> torch.device:
 
 def cores() -> int:
     """Return how many cores this rank may use: the ranks of a machine share them."""
-    if hasattr(os, "sched_getaffinity"):
-        available = len(os.sched_getaffinity(0))
-    else:
-        available = os.cpu_count() or 1
     sharing = int(os.environ.get("LOCAL_WORLD_SIZE", "1")) if size() > 1 else 1
-    return max(1, available // sharing)
+    return max(1, len(os.sched_getaffinity(0)) // sharing)
 
 
 def gather(values: Tensor) -> Tensor:

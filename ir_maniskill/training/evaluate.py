@@ -24,13 +24,11 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from ir_maniskill.environment.process_vector import ProcessVectorEnv
 from ir_maniskill.environment.state import StateStack
-from ir_maniskill.environment.vector import GpuVectorEnv, make_vec
+from ir_maniskill.environment.vector import VectorEnv, make_vec
 
 Policy = Callable[[dict[str, Tensor]], Tensor]
 """Maps the state s_t of N envs to their actions [N, 26] in [-1, 1]."""
-VectorEnv = GpuVectorEnv | ProcessVectorEnv
 
 EVALUATION_SEED = 2_000_000
 """Seed of the first episode that figures are made of, apart from those of training and

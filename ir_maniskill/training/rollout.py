@@ -8,12 +8,10 @@ import torch
 from torch import Tensor
 
 from ir_maniskill.agent.agent import Act, Agent, State
-from ir_maniskill.environment.vector import GpuVectorEnv, ProcessVectorEnv
+from ir_maniskill.environment.vector import VectorEnv
 from ir_maniskill.training import distributed
 from ir_maniskill.training.config import PPOConfig
 from ir_maniskill.training.finite import check_finite
-
-VectorEnv = GpuVectorEnv | ProcessVectorEnv
 
 
 @dataclass
