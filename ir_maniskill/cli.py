@@ -135,7 +135,7 @@ class Doctor:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Runs the command line and exits with its code.
+    """Run the command line and exit with its code.
 
     The code is 0 if all went well, 1 if the doctor found a fault, 2 for a request that
     cannot be carried out, and 130 after Ctrl-C, SIGTERM or a terminal that is closed.
@@ -149,7 +149,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Carries out one command and returns its exit code."""
+    """Carry out one command and return its exit code."""
     try:
         command = parse(arguments)
         return _COMMANDS[type(command)](command)
@@ -161,7 +161,7 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def _in_one_line(error: Exception) -> str:
-    """Returns an error's message, without a traceback that a worker sent along."""
+    """Return an error's message, without a traceback that a worker sent along."""
     message = str(error) or type(error).__name__
     if "Traceback" not in message:
         return message
@@ -170,7 +170,7 @@ def _in_one_line(error: Exception) -> str:
 
 
 def parse(arguments: Sequence[str]) -> Any:
-    """Returns the command that the arguments ask for.
+    """Return the command that the arguments ask for.
 
     A preset gives the defaults of the other options of `train`, hence the look ahead.
     """
@@ -209,7 +209,7 @@ def _tasks(_: Tasks) -> int:
 
 
 def _describe(experiment: Experiment) -> tuple[str, str, str, str, str]:
-    """Returns the row of an experiment in the table of tasks."""
+    """Return the row of an experiment in the table of tasks."""
     sentences = experiment.sentences
     more = f" (+{len(sentences) - 1})" if len(sentences) > 1 else ""
     colors = ", ".join(thing.color for thing in experiment.objects)
@@ -330,7 +330,7 @@ def _doctor(_: Doctor) -> int:
 
 
 def _find_policy(task: Experiment, given: Path | None) -> Path:
-    """Returns the policy file to use: the one given, or the shipped one."""
+    """Return the policy file to use: the one given, or the shipped one."""
     if given is not None:
         if not given.is_file():
             raise UsageError(f"--checkpoint: got {given}, expected an existing file")
@@ -349,7 +349,7 @@ def _find_policy(task: Experiment, given: Path | None) -> Path:
 def _load(
     path: Path, task: Experiment, any_task: bool
 ) -> tuple[Agent, TrainConfig, dict[str, Any]]:
-    """Returns what `load_policy` does, of a policy for this task."""
+    """Return what `load_policy` does, of a policy for this task."""
     agent, config, facts = load_policy(path)
     if config.env_id != task.id and not any_task:
         raise UsageError(
@@ -360,7 +360,7 @@ def _load(
 
 
 def _find_instruction(task: Experiment, text: str | None) -> tuple[int, ...] | None:
-    """Returns the index of a sentence of the task; None: all of them."""
+    """Return the index of a sentence of the task; None: all of them."""
     if text is None:
         return None
     known = [sentence.lower().rstrip(".") for sentence in task.sentences]
@@ -377,7 +377,7 @@ def _require(name: str, value: int, least: int) -> None:
 
 
 def _require_writable(path: Path) -> None:
-    """Raises before the work is done whose result could not be written."""
+    """Raise before the work is done whose result could not be written."""
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         new = not path.exists()

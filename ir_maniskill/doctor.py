@@ -97,7 +97,7 @@ class Diagnosis:
         return self.render_error is None and None not in self.packages.values()
 
     def as_dict(self) -> dict[str, Any]:
-        """Returns plain data for JSON."""
+        """Return plain data for JSON."""
         return {**asdict(self), "healthy": self.healthy}
 
     def __str__(self) -> str:
@@ -117,7 +117,7 @@ class Diagnosis:
 
 
 def diagnose() -> Diagnosis:
-    """Examines this machine; the render probe runs in a process of its own.
+    """Examine this machine; the render probe runs in a process of its own.
 
     A broken driver can end the process that asks it for a picture, hence the process.
     """
@@ -143,7 +143,7 @@ def diagnose() -> Diagnosis:
 
 
 def require_vulkan() -> None:
-    """Raises one clear error if SAPIEN finds no Vulkan device to render with.
+    """Raise one clear error if SAPIEN finds no Vulkan device to render with.
 
     Cheap where there is one: it asks SAPIEN in this process.
 
@@ -165,7 +165,7 @@ def require_vulkan() -> None:
 
 
 def read_os_release(path: Path = Path("/etc/os-release")) -> dict[str, str]:
-    """Reads the distribution's name and version; empty where the file is missing."""
+    """Read the distribution's name and version; empty where the file is missing."""
     try:
         text = path.read_text(encoding="utf-8")
     except OSError:
@@ -177,7 +177,7 @@ def read_os_release(path: Path = Path("/etc/os-release")) -> dict[str, str]:
 def prescribe(
     release: dict[str, str], apt: Path = Path("/etc/apt"), gpu: bool | None = None
 ) -> tuple[tuple[str, ...], str | None]:
-    """Finds what makes rendering work on a distribution.
+    """Find what makes rendering work on a distribution.
 
     Args:
         release: The distribution, as read by `read_os_release`.
@@ -211,7 +211,7 @@ def prescribe(
 
 
 def has_nvidia_driver() -> bool:
-    """Returns whether nvidia-smi is there and works."""
+    """Return whether nvidia-smi is there and works."""
     command = shutil.which("nvidia-smi")
     if command is None:
         return False
@@ -261,7 +261,7 @@ def _debian_12_commands(apt: Path) -> tuple[tuple[str, ...], str | None]:
 
 
 def _read_apt_entries(apt: Path) -> list[dict[str, str]]:
-    """Reads apt's binary package sources, in both of its formats."""
+    """Read apt's binary package sources, in both of its formats."""
     entries = []
     for path in sorted(apt.glob("sources.list.d/*.sources")):
         for stanza in re.split(r"\n\s*\n", path.read_text(encoding="utf-8")):
@@ -274,7 +274,7 @@ def _read_apt_entries(apt: Path) -> list[dict[str, str]]:
 
 
 def _parse_stanza(stanza: str) -> dict[str, str]:
-    """Reads one deb822 stanza, keeping the fields that say where packages are."""
+    """Read one deb822 stanza, keeping the fields that say where packages are."""
     fields = ("Types", "URIs", "Suites", "Components", "Signed-By")
     pairs = (line.partition(":") for line in stanza.splitlines())
     found = {k: v.strip() for k, _, v in pairs if k in fields and v.strip()}
@@ -282,7 +282,7 @@ def _parse_stanza(stanza: str) -> dict[str, str]:
 
 
 def _parse_line(line: str) -> dict[str, str]:
-    """Reads one line of the older format: deb [options] URI suite components."""
+    """Read one line of the older format: deb [options] URI suite components."""
     match = re.match(r"deb\s+(?:\[(.*?)\]\s+)?(\S+)\s+(\S+)\s+(.+)", line.strip())
     if match is None:
         return {}
@@ -293,7 +293,7 @@ def _parse_line(line: str) -> dict[str, str]:
 
 
 def _run_probe() -> dict[str, Any]:
-    """Draws a test picture in a process of its own and returns its report."""
+    """Draw a test picture in a process of its own and return its report."""
     command = [sys.executable, "-W", "ignore", "-c", _PROBE]
     try:
         done = subprocess.run(
@@ -309,7 +309,7 @@ def _run_probe() -> dict[str, Any]:
 
 
 def _device_name(summary: str) -> str:
-    """Returns the first supported device of SAPIEN's device summary."""
+    """Return the first supported device of SAPIEN's device summary."""
     for block in summary.split("GPU: ")[1:]:
         if re.search(r"Supported:\s*1", block):
             return block.splitlines()[0].strip()
@@ -330,7 +330,7 @@ def _describe_rendering(diagnosis: Diagnosis) -> str:
 
 
 def _physx_gpu_library(version: str | None) -> str | None:
-    """Returns where SAPIEN keeps its PhysX GPU library, if it is there."""
+    """Return where SAPIEN keeps its PhysX GPU library, if it is there."""
     if version is None:
         return None
     path = Path.home() / ".sapien" / "physx" / version / "libPhysXGpu_64.so"
@@ -350,7 +350,7 @@ def _as_number(version: str) -> float:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Prints the diagnosis; returns 0 if this machine can render, else 1."""
+    """Print the diagnosis; return 0 if this machine can render, else 1."""
     parser = argparse.ArgumentParser(prog="doctor", description=diagnose.__doc__)
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--quiet", action="store_true", help="only the exit code")

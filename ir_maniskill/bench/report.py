@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import os
 import platform
 from dataclasses import asdict, dataclass
@@ -11,7 +10,7 @@ from typing import Any
 
 import torch
 
-PACKAGES = ("ir-maniskill", "torch", "mani_skill", "sapien", "numpy")
+from ir_maniskill.training import evaluate
 
 
 @dataclass(frozen=True)
@@ -62,13 +61,12 @@ class Machine:
     @classmethod
     def here(cls) -> Machine:
         """Return the facts of this machine."""
-        versions = {name: importlib.metadata.version(name) for name in PACKAGES}
         return cls(
             cpu=_cpu_model(),
             cores=len(os.sched_getaffinity(0)),
             load=os.getloadavg()[0],
             renderer=_renderer(),
-            versions={"python": platform.python_version(), **versions},
+            versions=evaluate.versions(),
         )
 
     def __str__(self) -> str:

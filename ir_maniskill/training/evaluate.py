@@ -70,7 +70,7 @@ class Rate:
         return low, center + half if self.count < n else 1.0
 
     def as_dict(self, name: str) -> dict[str, Any]:
-        """Returns plain data for JSON."""
+        """Return plain data for JSON."""
         return {name: self.value, f"{name}_interval": list(self.interval)}
 
     def __str__(self) -> str:
@@ -96,7 +96,7 @@ class Score:
     """Sum of the rewards of an episode, mean over episodes."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Returns plain data for JSON."""
+        """Return plain data for JSON."""
         return {
             "episodes": self.success.total,
             **self.success.as_dict("success"),
@@ -124,7 +124,7 @@ class EvaluationReport:
     """Score over all episodes."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Returns plain data for JSON."""
+        """Return plain data for JSON."""
         return {
             "env_id": self.env_id,
             "seed": self.seed,
@@ -163,7 +163,7 @@ class SceneReport:
     """The same for every two sentences."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Returns plain data for JSON."""
+        """Return plain data for JSON."""
         return {
             "seed": self.seed,
             **self.exclusive.as_dict("exclusive"),
@@ -202,7 +202,7 @@ class _Record:
     def add(
         self, episode: Tensor, env: Tensor, reward: Tensor, info: dict[str, Tensor]
     ) -> None:
-        """Counts one step of the episodes that the chosen envs play."""
+        """Count one step of the episodes that the chosen envs play."""
         right, wrong = (
             info["right_fingers"][env].cpu(),
             info["wrong_fingers"][env].cpu(),
@@ -213,7 +213,7 @@ class _Record:
         self.exclusive[episode] = info["exclusive_success"][env].cpu()
 
     def score(self, chosen: Tensor) -> Score:
-        """Returns the score of the chosen episodes [E] bool."""
+        """Return the score of the chosen episodes [E] bool."""
         total = int(chosen.sum())
         sums = dict(zip(self.SUMS, self.sums[chosen].sum(dim=0).tolist(), strict=True))
         return Score(
@@ -239,7 +239,7 @@ def evaluate_policy(
     instructions: Sequence[int] | None = None,
     progress: bool = False,
 ) -> EvaluationReport:
-    """Plays episodes with a policy and counts what it touches.
+    """Play episodes with a policy and count what it touches.
 
     Episodes are spread evenly over the instructions: episode e is told instruction
     e modulo their number, and starts from seed + e.
@@ -286,7 +286,7 @@ def evaluate_scenes(
     envs: VectorEnv | None = None,
     progress: bool = False,
 ) -> SceneReport:
-    """Plays every scene once for each sentence and counts where all are obeyed.
+    """Play every scene once for each sentence and count where all are obeyed.
 
     Args:
         policy: Acts without noise on the state s_t.
@@ -322,13 +322,13 @@ def evaluate_scenes(
 
 
 def _all_of(obeyed: Iterable[Tensor]) -> Rate:
-    """Returns the share of scenes in which all hold, each [E] bool."""
+    """Return the share of scenes in which all hold, each [E] bool."""
     every = torch.stack(list(obeyed)).all(dim=0)
     return Rate(int(every.sum()), len(every))
 
 
 def write_report(path: Path, report: EvaluationReport, **facts: Any) -> None:
-    """Writes the report as JSON, with the versions and the machine it was made on.
+    """Write the report as JSON, with the versions and the machine it was made on.
 
     Args:
         path: The file.
@@ -341,14 +341,14 @@ def write_report(path: Path, report: EvaluationReport, **facts: Any) -> None:
 
 
 def versions() -> dict[str, str]:
-    """Returns the versions of what the figures depend on."""
+    """Return the versions of what the figures depend on."""
     names = ("ir-maniskill", "mani-skill", "sapien", "torch", "gymnasium", "numpy")
     found = {name: metadata.version(name) for name in names}
     return {"python": platform.python_version(), **found}
 
 
 def machine() -> dict[str, Any]:
-    """Returns what the figures were made on."""
+    """Return what the figures were made on."""
     cuda = torch.cuda.get_device_name(0) if torch.cuda.is_available() else None
     system = f"{platform.system()} {platform.machine()}"
     return {"platform": system, "cpus": os.cpu_count(), "cuda": cuda}
@@ -358,7 +358,7 @@ def machine() -> dict[str, Any]:
 def _opened(
     envs: VectorEnv | None, env_id: str, num_envs: int, kwargs: dict[str, Any] | None
 ) -> Iterator[VectorEnv]:
-    """Lends the envs given, or else some that are closed at the end.
+    """Lend the envs given, or else some that are closed at the end.
 
     Callers never make more envs than episodes: those would play what nobody counts.
     """
@@ -381,7 +381,7 @@ def _check_episodes(episodes: int, least: int = 1) -> None:
 def _choose_instructions(
     sentences: Sequence[str], wanted: Sequence[int] | None, episodes: int
 ) -> tuple[int, ...]:
-    """Returns the indices of the instructions to evaluate, all checked."""
+    """Return the indices of the instructions to evaluate, all checked."""
     everything = range(len(sentences))
     chosen = tuple(everything if wanted is None else wanted)
     if not chosen or any(index not in everything for index in chosen):
@@ -400,7 +400,7 @@ def _play(
     stack: StateStack,
     progress: bool,
 ) -> _Record:
-    """Plays all episodes, N at a time; episode e is told instruction told[e]."""
+    """Play all episodes, N at a time; episode e is told instruction told[e]."""
     episodes, n = len(told), envs.num_envs
     record = _Record(episodes)
     for first in tqdm(
@@ -424,7 +424,7 @@ def _play(
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Leaves the cores to the simulator: one row of a policy is too little to share."""
+    """Leave the cores to the simulator: one row of a policy is too little to share."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -434,7 +434,7 @@ def one_thread() -> Iterator[None]:
 
 
 def _act(policy: Policy, state: dict[str, Tensor], device: torch.device) -> Tensor:
-    """Returns the actions [N, 26], on the CPU computed for one env after another.
+    """Return the actions [N, 26], on the CPU computed for one env after another.
 
     How a matrix product is rounded depends on the number of rows, and contacts make
     much of little: alone, an env is acted on alike whatever others are beside it.
