@@ -10,7 +10,7 @@ import tyro
 
 from ir_maniskill import Experiment, Instruction, TouchObject, register
 from ir_maniskill.experiment import VOCABULARY
-from ir_maniskill.training.config import AgentConfig, TrainConfig
+from ir_maniskill.training.config import TrainConfig
 from ir_maniskill.training.train import train
 
 LEMON = TouchObject("yellow", (0.21, 0.06))  # x forward, y left of the torso [m]
@@ -29,9 +29,8 @@ def main(train_steps: int = 0) -> None:
     obs, _ = env.reset(seed=0)
     print(env.get_language_instruction(), obs["extra"]["instruction"])
     print("dense reward:", float(env.step(env.action_space.sample())[1]))
-    if train_steps:  # one more number than usual: this experiment has its own words
-        agent = AgentConfig(vocabulary=len(WORDS))
-        train(TrainConfig(FRUIT.id, "runs/fruit", total_steps=train_steps, agent=agent))
+    if train_steps:
+        train(TrainConfig(FRUIT.id, "runs/fruit", total_steps=train_steps))
 
 
 if __name__ == "__main__":

@@ -4,8 +4,10 @@
     python examples/train.py triangle --preset paper
     python examples/train.py multi --resume
 
-Learns from the two cameras and the sentence. Ctrl-C keeps a checkpoint, from which
---resume goes on. `ir-maniskill train ID` does the same with every number as an option.
+The default preset gives the policy the sentence, two cameras, joints and touch, and
+lets its critic and an auxiliary loss read the simulator's state in training; the
+paper's gives it what the paper does. Ctrl-C keeps a checkpoint, from which --resume
+goes on. `ir-maniskill train ID` does the same with every number as an option.
 """
 
 import logging
