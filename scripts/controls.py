@@ -20,6 +20,7 @@ from torch import Tensor
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.instructional_set import InstructionalSet
+from ir_maniskill.environment.state import State
 from ir_maniskill.environment.vector import make_vec
 from ir_maniskill.experiment import Experiment
 from ir_maniskill.training.checkpoint import load_policy
@@ -34,7 +35,6 @@ ROOT = Path(__file__).parent.parent
 OUT = ROOT / "docs" / "results" / "controls.json"
 SHIPPED = ROOT / "assets" / "policies"
 
-State = dict[str, Tensor]
 Change = Callable[[State], State]
 """Takes something from the state s_t that the policy gets."""
 
