@@ -110,8 +110,20 @@ class Run:
     @property
     def changes(self) -> list[str]:
         """Fields in which it differs from that preset, and their values."""
-        changes = self._changes(self.preset)
-        return [f"{key} {_plain(value)}" for key, value in sorted(changes.items())]
+        changes = sorted(self._changes(self.preset).items())
+        idle = self._idle()
+        return [f"{key} {_plain(value)}" for key, value in changes if key not in idle]
+
+    def _idle(self) -> set[str]:
+        """Return weights of the dense reward that this run did not feel."""
+        weights = self.config["dense_weights"]
+        if self.config["reward_mode"] == "sparse":
+            idle = set(weights)
+        elif catalog.get(self.task).reward == "binary":
+            idle = {"gather", "gather_scale"}
+        else:
+            idle = set() if weights["gather"] else {"gather_scale"}
+        return {f"dense_weights.{name}" for name in idle}
 
     @property
     def label(self) -> str:

@@ -67,7 +67,7 @@ class DenseWeights:
     gather: float = 4.0
     """Reward of bringing all fingers to the named object, at most; only where each
     finger counts."""
-    gather_scale: float = 0.05
+    gather_scale: float = 0.1
     """Distance at which a finger's part of `gather` has fallen to a quarter [m]."""
     wrong: float = 0.5
     """Taken while another object is touched by any finger."""

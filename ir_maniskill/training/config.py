@@ -75,7 +75,7 @@ class AgentConfig:
     """How the standard deviation of the action noise evolves."""
     std: float = 0.5
     """Standard deviation of the action noise at the start."""
-    std_final: float = 0.2
+    std_final: float = 0.05
     """Standard deviation at the end, if annealed."""
     auxiliary_weight: float = 3.0
     """Weight of the loss that predicts where the named object is; 0: no such head."""
