@@ -136,6 +136,8 @@ def test_wrong_shapes_are_refused(envs: ProcessVectorEnv) -> None:
         envs.step(torch.full((3, 26), torch.nan))
     with pytest.raises(ValueError, match="seeds: got 2, expected 3"):
         envs.reset(seed=[1, 2])
+    with pytest.raises(ValueError, match="options: got 'env_idx'"):
+        envs.reset(options={"env_idx": torch.tensor([0])})
     with pytest.raises(ValueError, match="num_envs: got 0"):
         make_vec(TASK, 0)
     with pytest.raises(catalog.UnknownExperimentError, match="available"):

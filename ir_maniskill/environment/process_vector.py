@@ -221,10 +221,15 @@ class ProcessVectorEnv(VectorEnv):
             options: Passed to the envs; a tensor of N values is dealt out, one each.
 
         Raises:
-            ValueError: The list has not N seeds.
+            ValueError: The list has not N seeds, or the options name some of the envs.
             WorkerError: A worker refused an option, failed, died or hangs; or it has
                 not answered the last command.
         """
+        if "env_idx" in (options or {}):
+            raise ValueError(
+                "options: got 'env_idx', expected none: worker processes reset all "
+                "envs at once, and each by itself when its episode ends"
+            )
         if seed is None and not self._seeded:
             seed = FIRST_SEED
         if isinstance(seed, int):
