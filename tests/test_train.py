@@ -334,9 +334,11 @@ def test_a_reward_that_is_no_number_is_named(tmp_path):
 
 
 def test_the_noise_shrinks_as_steps_are_made(tmp_path):
-    run(toy_config(tmp_path))
+    config = toy_config(tmp_path)
+    agent = dataclasses.replace(config.agent, std=0.5, std_final=0.1)
+    run(dataclasses.replace(config, agent=agent))
     got = [float(row["std"]) for row in rows(tmp_path, "metrics")]
-    assert got == pytest.approx([0.5, 0.425, 0.35, 0.275], abs=1e-4)
+    assert got == pytest.approx([0.5, 0.4, 0.3, 0.2], abs=1e-4)
 
 
 @pytest.mark.slow
