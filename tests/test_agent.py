@@ -142,7 +142,7 @@ def test_first_actions_are_near_the_middle_with_the_given_deviation():
 def test_only_a_learned_deviation_is_a_parameter():
     state = make_state()
     names = {m: dict(make_agent(state, std_mode=m).named_parameters()).keys()
-             for m in ("fixed", "annealed", "learned")}  # fmt: skip
+             for m in ("fixed", "annealed", "decayed", "learned")}  # fmt: skip
     assert [m for m in names if "actor.log_std" in names[m]] == ["learned"]
 
 

@@ -7,12 +7,13 @@ import json
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from toy_envs import LENGTH, ToyVectorEnv, toy_config
+from toy_envs import LENGTH, SENTENCES, ToyVectorEnv, toy_config
 
 from ir_maniskill.training import checkpoint
 from ir_maniskill.training import train as training
 from ir_maniskill.training.checkpoint import CheckpointError
 from ir_maniskill.training.config import AgentConfig, ConfigError, TrainConfig
+from ir_maniskill.training.evaluate import EvaluationReport, Rate, Score
 from ir_maniskill.training.finite import TrainingDivergedError
 from ir_maniskill.training.run_folder import RunFolder
 from ir_maniskill.training.train import train
@@ -82,6 +83,28 @@ def test_training_learns_the_toy_task_and_stops_when_told(tmp_path):
     _, stored, metadata = checkpoint.load_policy(best)
     assert stored == config
     assert metadata["evaluation"] == report
+
+
+@pytest.mark.parametrize(("reward", "best"), [("binary", 1), ("per_finger", 2)])
+def test_the_best_policy_holds_longest_or_with_the_most_fingers(
+    tmp_path, monkeypatch, reward, best
+):
+    rates = {"success": Rate(4, 4), "exclusive": Rate(4, 4)}
+    scores = [
+        Score(**rates, touching=t, right_fingers=f, wrong_fingers=0, mean_return=0)
+        for t, f in ((0.9, 0.9), (0.8, 1.6), (0.7, 0.7))
+    ]
+    reports = iter(
+        EvaluationReport("Toy-v1", 0, 4, dict.fromkeys(SENTENCES, score), score)
+        for score in (*scores, scores[0])
+    )
+    monkeypatch.setattr(training, "evaluate_policy", lambda *_, **__: next(reports))
+    envs = ToyVectorEnv()
+    envs.experiment.reward = reward
+    steps = {"total_steps": 3 * UPDATE, "eval_interval": UPDATE}
+    path = train(toy_config(tmp_path, **steps), envs=envs)
+    _, _, metadata = checkpoint.load_policy(path)
+    assert metadata["steps"] == best * UPDATE
 
 
 def test_training_leaves_its_records(tmp_path):
@@ -333,12 +356,17 @@ def test_a_reward_that_is_no_number_is_named(tmp_path):
     assert checkpoint.read(tmp_path / "last.safetensors").metadata["steps"] == 0
 
 
-def test_the_noise_shrinks_as_steps_are_made(tmp_path):
+@pytest.mark.parametrize(
+    ("mode", "expected"),
+    [("annealed", [0.5, 0.4, 0.3, 0.2]), ("decayed", [0.8, 0.4, 0.2, 0.1])],
+)
+def test_the_noise_shrinks_as_steps_are_made(tmp_path, mode, expected):
     config = toy_config(tmp_path)
-    agent = dataclasses.replace(config.agent, std=0.5, std_final=0.1)
-    run(dataclasses.replace(config, agent=agent))
+    final = {"annealed": 0.1, "decayed": 0.05}[mode]
+    noise = {"std_mode": mode, "std": expected[0], "std_final": final}
+    run(dataclasses.replace(config, agent=dataclasses.replace(config.agent, **noise)))
     got = [float(row["std"]) for row in rows(tmp_path, "metrics")]
-    assert got == pytest.approx([0.5, 0.4, 0.3, 0.2], abs=1e-4)
+    assert got == pytest.approx(expected, abs=1e-4)
 
 
 @pytest.mark.slow

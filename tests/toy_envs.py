@@ -27,7 +27,11 @@ class ToyVectorEnv:
         self.single_action_space = Box(-1, 1, (JOINTS,))
         senses = ("vision", "proprioception") if images else ("proprioception",)
         self.experiment = SimpleNamespace(
-            id=env_id, sentences=SENTENCES, senses=senses, vocabulary=VOCABULARY
+            id=env_id,
+            sentences=SENTENCES,
+            senses=senses,
+            vocabulary=VOCABULARY,
+            reward="binary",
         )
         self.joints = torch.zeros(num_envs, JOINTS)
         self.told = torch.zeros(num_envs, dtype=torch.long)

@@ -18,7 +18,7 @@ Vision = Literal["patches", "paper"]
 CriticInput = Literal["asymmetric", "separate", "shared"]
 ControlMode = Literal["pd_joint_target_delta_pos", "pd_joint_pos"]
 RewardMode = Literal["dense", "normalized_dense", "sparse"]
-StdMode = Literal["annealed", "fixed", "learned"]
+StdMode = Literal["annealed", "decayed", "fixed", "learned"]
 
 Config = TypeVar("Config")
 
@@ -72,11 +72,13 @@ class AgentConfig:
     """What the critic reads: the simulator's state instead of images, its own encoder
     of the actor's senses, or the actor's B_t."""
     std_mode: StdMode = "annealed"
-    """How the standard deviation of the action noise evolves."""
+    """How the standard deviation of the action noise evolves: to `std_final` by the
+    same amount ("annealed") or the same factor ("decayed") each step, not at all, or as
+    it is learned."""
     std: float = 0.5
     """Standard deviation of the action noise at the start."""
     std_final: float = 0.05
-    """Standard deviation at the end, if annealed."""
+    """Standard deviation at the end, if annealed or decayed."""
     auxiliary_weight: float = 3.0
     """Weight of the loss that predicts where the named object is; 0: no such head."""
 

@@ -240,11 +240,15 @@ class Trainer:
         """Evaluate the policy on pinned scenes; keep it if it is the best so far.
 
         The best has the highest sum, equally weighted, of the worst sentence's success,
-        the exclusive success and the share of steps in touch.
+        the exclusive success and the share of steps in touch; where each finger
+        counts, of all fingers instead, that are on the named object.
         """
         report = self._report(self.agent, self.config.eval_episodes)
         figures = _figures(report)
-        score = sum(figures[f"eval/{k}"] for k in ("worst", "exclusive", "touching"))
+        held = figures["eval/touching"]
+        if self.envs.experiment.reward == "per_finger":
+            held = figures["eval/right_fingers"] / self.state["touch"].shape[2]
+        score = figures["eval/worst"] + figures["eval/exclusive"] + held
         if score > self.best_score:
             self.best_score = score
             self._keep(self.agent, self.steps, report)
@@ -379,11 +383,13 @@ class Trainer:
         return to(self.stack.reset(obs), self.device)
 
     def _anneal(self) -> None:
-        """Let the action noise shrink linearly with the share of the steps made."""
+        """Let the action noise shrink with the share of the steps made."""
         agent = self.config.agent
+        share = min(self.steps / self.config.total_steps, 1.0)
         if agent.std_mode == "annealed":
-            share = min(self.steps / self.config.total_steps, 1.0)
             self.agent.actor.set_std(agent.std + share * (agent.std_final - agent.std))
+        elif agent.std_mode == "decayed":
+            self.agent.actor.set_std(agent.std * (agent.std_final / agent.std) ** share)
 
     def _due(self, interval: int) -> bool:
         """Whether a multiple of the interval was passed by the last update."""
