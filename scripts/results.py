@@ -17,7 +17,7 @@ import csv
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from ir_maniskill import experiment as catalog
-from ir_maniskill.training.config import CONFIGS
+from ir_maniskill.training.config import CONFIGS, TrainConfig, decode, to_json
 from ir_maniskill.training.plots import Curve, compare
 
 Figures = Mapping[str, Any]
@@ -195,9 +195,13 @@ def keep(run: Run, folder: Path = FOLDER) -> None:
 
 
 def kept(folder: Path = FOLDER) -> list[Run]:
-    """Return all runs that were taken in."""
-    paths = sorted((folder / "runs").glob("*.json"))
-    return [Run(**json.loads(path.read_text())) for path in paths]
+    """Return all runs that were taken in, each with every field of today's config."""
+    runs = []
+    for path in sorted((folder / "runs").glob("*.json")):
+        run = Run(**json.loads(path.read_text()))
+        config = to_json(decode(TrainConfig, run.config))
+        runs.append(replace(run, config=json.loads(config)))
+    return runs
 
 
 def _rows(table: Path) -> list[dict[str, float]]:

@@ -23,6 +23,7 @@ from ir_maniskill.training import checkpoint
 from ir_maniskill.training.checkpoint import CheckpointError, Stored
 from ir_maniskill.training.config import (
     CONFIGS,
+    LATER,
     AgentConfig,
     ConfigError,
     PPOConfig,
@@ -97,6 +98,13 @@ def test_a_missing_field_is_named():
     del data["ppo"]["clip"]
     with pytest.raises(ConfigError, match=r"PPOConfig.*missing: \['clip'\]"):
         from_json(json.dumps(data))
+
+
+def test_files_from_before_a_field_was_added_keep_their_meaning():
+    data = json.loads(to_json(TrainConfig()))
+    for field in LATER["TrainConfig"]:
+        del data[field]
+    assert from_json(json.dumps(data)) == TrainConfig()
 
 
 def replace_leaf(data, path, value):

@@ -206,3 +206,12 @@ def test_coming_nearer_and_sparing_the_others_never_costs(
 def test_weights_that_cannot_work_are_refused(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"dense_weights: got {name}={value}"):
         DenseWeights(**{name: value})
+
+
+def test_the_price_of_other_objects_grows_from_nothing() -> None:
+    weights = DenseWeights(wrong=0.4, spoiled=0.2)
+    free, half = weights.at_price(0.0), weights.at_price(0.5)
+    assert (free.wrong, free.spoiled) == (0.0, 1.0)
+    assert (half.wrong, half.spoiled) == pytest.approx((0.2, 0.6))
+    assert (half.reach, half.gather) == (weights.reach, weights.gather)
+    assert weights.at_price(1.0) == weights

@@ -9,6 +9,7 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from toy_envs import LENGTH, SENTENCES, ToyVectorEnv, toy_config
 
+from ir_maniskill.environment.reward_generator import DenseWeights
 from ir_maniskill.training import checkpoint
 from ir_maniskill.training import train as training
 from ir_maniskill.training.checkpoint import CheckpointError
@@ -367,6 +368,16 @@ def test_the_noise_shrinks_as_steps_are_made(tmp_path, mode, expected):
     run(dataclasses.replace(config, agent=dataclasses.replace(config.agent, **noise)))
     got = [float(row["std"]) for row in rows(tmp_path, "metrics")]
     assert got == pytest.approx(expected, abs=1e-4)
+
+
+def test_other_objects_get_their_price_as_steps_are_made(tmp_path):
+    prices = []
+    envs = ToyVectorEnv()
+    envs.set_attr = lambda name, value: prices.append((name, value.wrong))
+    train(toy_config(tmp_path, lenient_steps=2 * UPDATE), envs=envs)
+    usual = DenseWeights().wrong
+    expected = [0, usual / 2, usual, usual]
+    assert prices == [("dense_weights", price) for price in expected]
 
 
 @pytest.mark.slow

@@ -22,10 +22,15 @@ import ir_maniskill
 from ir_maniskill import experiment as catalog
 from ir_maniskill.environment import process_vector, vector
 from ir_maniskill.environment.process_vector import ProcessVectorEnv, WorkerError
+from ir_maniskill.environment.reward_generator import DenseWeights
 from ir_maniskill.environment.vector import make_vec
 
 TASK = "NaoTouchCubeTriangle-v1"
-KWARGS = {"obs_mode": "state_dict", "render_backend": "none"}
+KWARGS = {
+    "obs_mode": "state_dict",
+    "reward_mode": "dense",
+    "render_backend": "none",
+}
 
 
 @pytest.fixture(scope="module")
@@ -129,6 +134,22 @@ def test_options_are_dealt_out_one_each(envs: ProcessVectorEnv) -> None:
     assert obs["extra"]["target_object"].argmax(1).tolist() == wanted.tolist()
 
 
+def test_attributes_are_set_for_all_or_one_each(envs: ProcessVectorEnv) -> None:
+    def rewards() -> list[float]:
+        envs.reset(seed=[7, 7, 7])
+        return envs.step(torch.zeros(3, 26))[1].tolist()
+
+    usual = DenseWeights()
+    none = DenseWeights(reach=0, gather=0)
+    envs.set_attr("dense_weights", [usual, none, usual])
+    one, other, third = rewards()
+    assert one == third > other == 0
+    envs.set_attr("dense_weights", usual)
+    assert rewards() == [one] * 3
+    with pytest.raises(ValueError, match="dense_weights: got 2 values, expected 3"):
+        envs.set_attr("dense_weights", [usual, usual])
+
+
 def test_wrong_shapes_are_refused(envs: ProcessVectorEnv) -> None:
     with pytest.raises(ValueError, match=r"got shape \(2, 26\), expected \(3, 26\)"):
         envs.step(torch.zeros(2, 26))
@@ -176,7 +197,7 @@ def test_workers_know_what_the_environment_says_now(
 
 def test_a_failing_worker_says_why() -> None:
     with pytest.raises(WorkerError, match=r"worker-0 \(envs 0 to 0\)(.|\n)*smell"):
-        make_vec(TASK, 1, sim_backend="physx_cpu", reward_mode="smell", **KWARGS)
+        make_vec(TASK, 1, sim_backend="physx_cpu", **KWARGS | {"reward_mode": "smell"})
 
 
 def test_a_dead_worker_is_named_and_close_leaves_nothing() -> None:
@@ -288,6 +309,10 @@ def test_a_batch_on_a_gpu_is_seeded_alike(monkeypatch: pytest.MonkeyPatch) -> No
     assert resets == [([7, 8, 9], None), ([5, 3, 4], None), (None, some)]
     with pytest.raises(ValueError, match="seed: got 7 for some of the envs"):
         envs.reset(seed=7, options=some)
+    envs.set_attr("dense_weights", "new")
+    assert base.dense_weights == "new"
+    with pytest.raises(ValueError, match="dense_weights: got 3 values, expected one"):
+        envs.set_attr("dense_weights", ["new"] * 3)
 
 
 def test_pictures_cross_the_process_border(multi_vec: ProcessVectorEnv) -> None:

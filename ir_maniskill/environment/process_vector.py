@@ -301,6 +301,27 @@ class ProcessVectorEnv(VectorEnv):
         obs = shared.read("obs")
         return obs, now["reward"], now["terminated"], now["truncated"], info
 
+    def set_attr(self, name: str, values: Any) -> None:
+        """Set an attribute of every env, such as "dense_weights".
+
+        Args:
+            name: Of the attribute.
+            values: A list or tuple of N values, one each, or one value for all.
+
+        Raises:
+            ValueError: The list has not N values.
+            WorkerError: A worker died or hangs, or has not answered the last command.
+        """
+        if not isinstance(values, list | tuple):
+            values = [values] * self.num_envs
+        if len(values) != self.num_envs:
+            raise ValueError(
+                f"{name}: got {len(values)} values, expected {self.num_envs}"
+            )
+        self._command(
+            "set_attr", [(name, [values[r] for r in rows]) for rows in self._rows]
+        )
+
     def close_extras(self, **kwargs: Any) -> None:
         """End all workers; none is left behind, whatever state it is in."""
         for pipe in self._pipes:
@@ -438,6 +459,12 @@ class _Worker:
     def _reset(self, index: int, seed: int | None, options: dict | None) -> None:
         obs, info = self._envs[index].reset(seed=seed, options=options)
         self._shared.write(self._rows[index], {"obs": obs, "info": info})
+
+    def set_attr(self, argument: tuple[str, list]) -> None:
+        """Set an attribute of every env."""
+        name, values = argument
+        for env, value in zip(self._envs, values, strict=True):
+            setattr(env.unwrapped, name, value)
 
     def step(self, _: None) -> None:
         """Step every env, and reset it if its episode is over."""

@@ -6,7 +6,7 @@ Nothing here knows the simulator. Legend: N envs, F fingers, C objects.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -74,6 +74,11 @@ class DenseWeights:
     spoiled: float = 0.25
     """Share of touch and `gather` that is left once another object has been touched
     in the episode: what makes touching only the named object worth learning."""
+
+    def at_price(self, share: float) -> DenseWeights:
+        """Return the weights with this share of the price of other objects, 0 to 1."""
+        spoiled = self.spoiled + (1 - share) * (1 - self.spoiled)
+        return replace(self, wrong=share * self.wrong, spoiled=spoiled)
 
     def __post_init__(self) -> None:
         """Check the fields.

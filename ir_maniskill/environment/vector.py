@@ -93,6 +93,18 @@ class GpuVectorEnv(ManiSkillVectorEnv):
             seed = list(range(seed, seed + self.num_envs))
         return super().reset(seed=seed, options=options)
 
+    def set_attr(self, name: str, values: Any) -> None:
+        """Set an attribute of the batched env, such as "dense_weights".
+
+        Raises:
+            ValueError: There is a list of values, but a batch shares one.
+        """
+        if isinstance(values, list | tuple):
+            raise ValueError(
+                f"{name}: got {len(values)} values, expected one: a batch shares it"
+            )
+        setattr(self.base_env, name, values)
+
 
 VectorEnv = GpuVectorEnv | ProcessVectorEnv
 """What `make_vec` makes."""

@@ -188,6 +188,9 @@ class TrainConfig:
     the named object alone, "normalized_dense" is that over the most it can give."""
     dense_weights: DenseWeights = field(default_factory=DenseWeights)
     """What counts how much in the dense reward."""
+    lenient_steps: int = 0
+    """Steps over which the price of touching other objects (`dense_weights.wrong` and
+    `spoiled`) grows from nothing to what it is: first to touch, then to touch alone."""
     shader_pack: str | None = "unlit"
     """Shader pack of the cameras: "unlit" paints base colors and is by far the
     cheapest, "minimal" and "default" are lit; None: the task's own."""
@@ -219,6 +222,9 @@ class TrainConfig:
         positive += "eval_interval eval_episodes checkpoint_interval"
         for name in positive.split():
             _require(getattr(self, name) > 0, name, getattr(self, name), "at least 1")
+        _require(
+            self.lenient_steps >= 0, "lenient_steps", self.lenient_steps, "0 or more"
+        )
         for name in ("num_workers", "threads"):
             value = getattr(self, name)
             _require(value is None or value > 0, name, value, "at least 1, or None")
@@ -311,20 +317,25 @@ CONFIGS: dict[str, TrainConfig] = {
 """The named configurations: "paper" as published, "default" as tuned."""
 
 
+LATER: dict[str, dict[str, object]] = {"TrainConfig": {"lenient_steps": 0}}
+"""Fields that older files lack, by class, with the values that those files meant."""
+
+
 def to_json(config: object) -> str:
     """Return the JSON text of a configuration dataclass."""
     return json.dumps(dataclasses.asdict(config), indent=2)  # type: ignore[call-overload]
 
 
 def decode(cls: type[Config], data: object) -> Config:
-    """Return the dataclass `cls` from plain JSON data, strictly.
+    """Return the dataclass `cls` from plain JSON data, strictly but for `LATER`.
 
     Raises:
         ConfigError: if a field is unknown, missing, of another type than declared, or
             out of its range.
     """
     _require(isinstance(data, dict), cls.__name__, data, "an object of its fields")
-    values = typing.cast("dict[str, object]", data)
+    known = LATER.get(cls.__name__, {})
+    values = known | typing.cast("dict[str, object]", data)
     hints = typing.get_type_hints(cls)
     unknown, missing = sorted(values.keys() - hints), sorted(hints.keys() - values)
     expected = f"exactly its fields (missing: {missing}, unknown: {unknown})"

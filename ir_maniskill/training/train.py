@@ -196,6 +196,7 @@ class Trainer:
         """Collect roll-outs and improve the agent on them."""
         config, start = self.config, time.perf_counter()
         self._anneal()
+        self._set_price()
         torch.set_num_threads(1)  # the cores belong to the simulator's workers
         self.state, sums = collect(
             self.envs, self.stack, self.state, self.agent, self.rollout, config.ppo
@@ -390,6 +391,13 @@ class Trainer:
             self.agent.actor.set_std(agent.std + share * (agent.std_final - agent.std))
         elif agent.std_mode == "decayed":
             self.agent.actor.set_std(agent.std * (agent.std_final / agent.std) ** share)
+
+    def _set_price(self) -> None:
+        """Let the price of touching other objects grow with the steps made."""
+        if self.config.lenient_steps:
+            share = min(self.steps / self.config.lenient_steps, 1.0)
+            weights = self.config.dense_weights.at_price(share)
+            self.envs.set_attr("dense_weights", weights)
 
     def _due(self, interval: int) -> bool:
         """Whether a multiple of the interval was passed by the last update."""
