@@ -48,7 +48,7 @@ def test_a_shipped_policy_says_where_it_comes_from(path: Path) -> None:
 def test_a_shipped_policy_does_what_it_is_told(path: Path) -> None:
     agent, config, _ = load_policy(path)
     score = play(agent.policy, config, episodes=6)
-    assert score.success.value >= 5 / 6
+    assert score.exclusive.value >= 5 / 6  # none sweeps up whatever there is
     assert score.touching > 0.6
 
 
