@@ -57,7 +57,7 @@ def ship(run: Path, episodes: int, scenes: int) -> EvaluationReport:
     figures = {**report.as_dict(), "commit": _commit()}
     if sentences > 1:
         same = evaluate_scenes(rounded.policy, config.env_id, scenes=scenes, **play)
-        figures["same_scene"] = {"scenes": scenes, **same.as_dict()}
+        figures["same_scene"] = same.as_dict()
     path = FOLDER / f"{config.env_id}.safetensors"
     path.parent.mkdir(exist_ok=True)
     save(path, evaluation=figures)

@@ -23,7 +23,7 @@ class ScriptedEnvs:
     """
 
     device = torch.device("cpu")
-    experiment = SimpleNamespace(sentences=SENTENCES)
+    experiment = SimpleNamespace(id="Scripted-v1", sentences=SENTENCES)
 
     def __init__(self, num_envs):
         self.num_envs, self.resets, self.closed = num_envs, [], False
@@ -140,8 +140,11 @@ def test_episodes_have_pinned_seeds_and_instructions_in_turn():
     assert envs.resets == [(0, [0, 1, 0, 1]), (4, [0, 1, 0, 1])]
 
 
-def test_envs_that_are_given_stay_open():
-    _, envs = scripted(num_envs=2)
+def test_envs_that_are_given_stay_open_and_name_the_task():
+    envs = ScriptedEnvs(2)
+    given = {"seed": 0, "envs": envs}
+    assert evaluate_policy(still, "", episodes=2, **given).env_id == "Scripted-v1"
+    assert evaluate_scenes(still, "", scenes=2, **given).env_id == "Scripted-v1"
     assert not envs.closed
 
 
@@ -223,6 +226,7 @@ def test_a_scene_counts_if_every_sentence_is_obeyed_in_it(num_envs):
         assert each == [[0] * num_envs, [1] * num_envs]
     data = json.loads(json.dumps(report.as_dict()))
     assert data["exclusive"] == pytest.approx(1 / 3)
+    assert (data["env_id"], data["scenes"]) == ("Scripted-v1", 9)
     assert data["pairs"][0]["sentences"] == list(SENTENCES)
 
 
@@ -231,7 +235,7 @@ def test_scenes_are_counted_one_by_one_and_not_on_average():
     report = evaluate_scenes(still, "S-v1", scenes=2, seed=2, envs=envs)
     # Seed 2 obeys both; seed 3 is odd and a multiple of 3 and obeys neither.
     assert report.exclusive == Rate(1, 2)
-    with pytest.raises(ValueError, match="got 0, expected at least 1"):
+    with pytest.raises(ValueError, match="scenes: got 0, expected at least 1"):
         evaluate_scenes(still, "S-v1", scenes=0, seed=2)
 
 

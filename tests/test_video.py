@@ -133,6 +133,15 @@ def test_other_names_and_empty_videos_are_refused(tmp_path):
         write_video(tmp_path / "a.gif", [])
 
 
+def test_a_film_of_no_instruction_is_refused():
+    blind = {"obs_mode": "state_dict", "render_backend": "none"}
+    films = video.record(
+        None, "NaoTouchCubeMulti-v1", instructions=[], env_kwargs=blind
+    )
+    with pytest.raises(ValueError, match=r"got \(\), available: 0: 'Touch the blue"):
+        next(films)
+
+
 @pytest.mark.slow
 @pytest.mark.render
 def test_the_video_shows_the_evaluated_episode(multi_vec, reflex, env_kwargs):

@@ -165,7 +165,9 @@ class SceneReport:
     def as_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
         return {
+            "env_id": self.env_id,
             "seed": self.seed,
+            "scenes": self.exclusive.total,
             **self.exclusive.as_dict("exclusive"),
             "pairs": [
                 {"sentences": list(pair), **rate.as_dict("exclusive")}
@@ -246,7 +248,7 @@ def evaluate_policy(
 
     Args:
         policy: Acts without noise on the state s_t.
-        env_id: The task.
+        env_id: The task of the envs to make.
         episodes: How many episodes; at least one for each instruction.
         seed: Seed of the first episode.
         num_envs: Envs to make, unless `envs` are given.
@@ -262,11 +264,12 @@ def evaluate_policy(
     _check_episodes(episodes)
     with _opened(envs, env_id, min(num_envs, episodes), env_kwargs) as envs:
         sentences = tuple(envs.experiment.sentences)
-        chosen = _choose_instructions(sentences, instructions, episodes)
+        chosen = choose_instructions(sentences, instructions)
+        _check_episodes(episodes, len(chosen))
         told = torch.tensor([chosen[e % len(chosen)] for e in range(episodes)])  # [E]
         record = _play(policy, envs, told, seed, StateStack(frames), progress)
     return EvaluationReport(
-        env_id=env_id,
+        env_id=envs.experiment.id,
         seed=seed,
         episodes=episodes,
         instructions={sentences[i]: record.score(told == i) for i in chosen},
@@ -290,7 +293,7 @@ def evaluate_scenes(
 
     Args:
         policy: Acts without noise on the state s_t.
-        env_id: The task.
+        env_id: The task of the envs to make.
         scenes: How many; as many episodes are played for every sentence.
         seed: Seed of the first scene.
         num_envs: Envs to make, unless `envs` are given.
@@ -302,7 +305,8 @@ def evaluate_scenes(
     Raises:
         ValueError: No scenes.
     """
-    _check_episodes(scenes)
+    if scenes < 1:
+        raise ValueError(f"scenes: got {scenes}, expected at least 1")
     with _opened(envs, env_id, min(num_envs, scenes), env_kwargs) as envs:
         sentences = tuple(envs.experiment.sentences)
         obeyed = {}  # [E] bool each
@@ -311,7 +315,7 @@ def evaluate_scenes(
             record = _play(policy, envs, told, seed, StateStack(frames), progress)
             obeyed[sentence] = record.exclusive
     return SceneReport(
-        env_id=env_id,
+        env_id=envs.experiment.id,
         seed=seed,
         exclusive=_all_of(obeyed.values()),
         pairs={
@@ -378,16 +382,23 @@ def _check_episodes(episodes: int, least: int = 1) -> None:
         )
 
 
-def _choose_instructions(
-    sentences: Sequence[str], wanted: Sequence[int] | None, episodes: int
+def choose_instructions(
+    sentences: Sequence[str], wanted: Sequence[int] | None
 ) -> tuple[int, ...]:
-    """Return the indices of the instructions to evaluate, all checked."""
+    """Return the indices of the instructions to play.
+
+    Args:
+        sentences: The I sentences of the experiment.
+        wanted: Which of them; None: all.
+
+    Raises:
+        ValueError: None is wanted, or one that there is not.
+    """
     everything = range(len(sentences))
     chosen = tuple(everything if wanted is None else wanted)
     if not chosen or any(index not in everything for index in chosen):
         listed = ", ".join(f"{i}: {s!r}" for i, s in enumerate(sentences))
         raise ValueError(f"instructions: got {chosen}, available: {listed}")
-    _check_episodes(episodes, len(chosen))
     return chosen
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -24,7 +25,7 @@ from PIL import Image, ImageDraw, ImageFont
 from ir_maniskill.environment.reward_generator import split_fingers
 from ir_maniskill.environment.state import CAMERAS, StateStack
 from ir_maniskill.environment.touch_env import CONTROL_FREQ
-from ir_maniskill.training.evaluate import Policy, one_thread
+from ir_maniskill.training.evaluate import Policy, choose_instructions, one_thread
 
 Box = tuple[int, int, int, int]
 """Left, top, width and height [pixel]."""
@@ -106,19 +107,18 @@ def record(
         frames: S, observations stacked into a state.
         env_kwargs: Keyword arguments for `gym.make`.
         instructions: Which of the experiment's instructions; None: all.
+
+    Raises:
+        ValueError: No instruction, or one that the task does not have.
     """
-    env = gym.make(env_id, num_envs=1, **(env_kwargs or {}))
-    base: Any = env.unwrapped
-    stage = _Stage(env_id, base.robot_uids)
-    try:
-        told = tuple(instructions or range(len(base.experiment.sentences)))
-        for episode in range(episodes):
-            options = {"instruction": told[episode % len(told)]}
-            obs, _ = env.reset(seed=seed + episode, options=options)
-            yield from _play(policy, env, obs, StateStack(frames), stage)
-    finally:
-        stage.close()
-        env.close()
+    with closing(gym.make(env_id, num_envs=1, **(env_kwargs or {}))) as env:
+        base: Any = env.unwrapped
+        told = choose_instructions(base.experiment.sentences, instructions)
+        with closing(_Stage(env_id, base.robot_uids)) as stage:
+            for episode in range(episodes):
+                options = {"instruction": told[episode % len(told)]}
+                obs, _ = env.reset(seed=seed + episode, options=options)
+                yield from _play(policy, env, obs, StateStack(frames), stage)
 
 
 class _Stage:
