@@ -3,13 +3,14 @@
 import os
 import re
 import runpy
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from ir_maniskill import available
+from ir_maniskill import available, cli
 from ir_maniskill.environment.robot.nao import ARM, HAND
 from ir_maniskill.experiment import get
 from ir_maniskill.training.config import CONFIGS
@@ -219,3 +220,19 @@ def test_links_lead_somewhere(page: Path) -> None:
 def test_readme_quick_start_runs(tmp_path: Path) -> None:
     (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert re.search(r"^tensor\(\[(True|False)", run(tmp_path, "-c", code), re.M)
+
+
+COMMAND = re.compile(r"^(?: {4}|.*--no-python |)ir-maniskill (.+)$", re.MULTILINE)
+"""A line of code that calls the program: what it is told."""
+
+
+def test_the_commands_of_the_pages_are_understood() -> None:
+    text = "\n".join(page.read_text() for page in PAGES).replace("\\\n", "")
+    before, recorded, after = re.split("<!-- (?:begin|end) commands -->", text)
+    commands = COMMAND.findall(before + after)  # the recorded runs' have their own test
+    assert COMMAND.findall(recorded) and len(commands) > 10
+    for command in commands:
+        try:
+            cli.parse(shlex.split(command, comments=True))
+        except SystemExit:
+            pytest.fail(f"got ir-maniskill {command}, expected what it understands")

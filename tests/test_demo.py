@@ -1,0 +1,68 @@
+"""`make demo` trains once; it evaluates, films and draws the curve each time."""
+
+import re
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ir_maniskill import cli
+
+ROOT = Path(__file__).parents[1]
+TASK = "NaoTouchCubeSingle-v1"
+PROGRAM = """\
+#!/bin/sh
+echo "$@" >> "$0.log"
+[ "$1" != train ] || touch best.safetensors evaluation.json
+"""
+"""Stands in for `ir-maniskill`: writes down what it is told, and ends a training."""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Returns an empty folder for the demonstration, beside the program."""
+    program = tmp_path / "ir-maniskill"
+    program.write_text(PROGRAM)
+    program.chmod(0o755)
+    run = tmp_path / "demo"
+    run.mkdir()
+    return run
+
+
+def demonstrate(folder: Path) -> list[Any]:
+    """Runs the script and returns the commands that it gave."""
+    program = folder.parent / "ir-maniskill"
+    script = [ROOT / "scripts" / "demo.sh", program, TASK, folder, "12"]
+    subprocess.run(script, cwd=folder, check=True, capture_output=True, timeout=60)
+    log = program.with_suffix(".log")
+    lines = log.read_text().splitlines()
+    log.unlink()
+    return [cli.parse(line.split()) for line in lines]
+
+
+def test_a_finished_training_is_not_made_again(folder: Path) -> None:
+    first, *rest = demonstrate(folder)
+    assert [type(command) for command in rest] == [cli.Evaluate, cli.Video, cli.Curve]
+    assert type(first) is cli.Train
+    assert demonstrate(folder) == rest
+
+
+def test_an_interrupted_training_goes_on(folder: Path) -> None:
+    (folder / "best.safetensors").touch()
+    training, *_ = demonstrate(folder)
+    assert training.resume and training.config.out == str(folder)
+
+
+def test_the_demonstration_perceives_and_leaves_what_the_readme_says(
+    folder: Path,
+) -> None:
+    training, evaluation, video, curve = demonstrate(folder)
+    assert training.config.agent.senses == ("vision",)
+    assert evaluation.episodes == 12
+    best = folder / "best.safetensors"
+    assert evaluation.checkpoint == video.checkpoint == best
+    paragraph = (ROOT / "README.md").read_text().split("**`make demo`**")[1]
+    named = re.findall(r"\(`(\S+\.\w+)`\)", paragraph.split("\n\n")[0])
+    left = (best, evaluation.json, video.out, curve.out)
+    assert named == [str(path.relative_to(folder)) for path in left]
