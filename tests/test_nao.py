@@ -106,6 +106,31 @@ def test_delta_targets_do_not_wind_up() -> None:
         assert target.item() == pytest.approx(1 - 0.2, abs=1e-5)
 
 
+def test_a_reset_to_a_state_restores_its_targets_too(env: TouchEnv) -> None:
+    env.reset(seed=0)
+    for row in np.random.default_rng(0).uniform(-1, 1, (5, 26)).astype(np.float32):
+        env.step(row)
+    wanted = env.agent.controller.target.clone()
+    for state in (env.get_state_dict(), env.get_state()):
+        env.reset()  # to other targets
+        env.reset(options={"reset_to_env_states": {"env_states": state}})
+        assert torch.equal(env.agent.controller.target, wanted)
+    env.reset()
+    qpos = env.agent.robot.get_qpos()[:, env.agent.controller.active_joint_indices]
+    torch.testing.assert_close(env.agent.controller.target, qpos)
+
+
+def test_a_reset_of_other_envs_leaves_the_targets(env: TouchEnv) -> None:
+    env.reset(seed=0)
+    env.step(action(env, LWristYaw=0.5))
+    wanted, everyone = env.agent.controller.target.clone(), env.scene._reset_mask
+    env.scene._reset_mask = ~everyone  # as in a batch, until the scene is laid out
+    env.agent.reset()
+    env.scene._reset_mask = everyone
+    env.agent.controller.reset()
+    assert torch.equal(env.agent.controller.target, wanted)
+
+
 def test_drives_have_the_real_motors_limits(env: TouchEnv) -> None:
     joint = env.agent.robot.joints_map["LShoulderPitch"]._objs[0]
     assert joint.get_force_limit() == pytest.approx(1.329)

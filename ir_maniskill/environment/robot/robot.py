@@ -51,11 +51,14 @@ class JointGroup:
 class TargetController(PDJointPosController):
     """Joint position targets, kept within the limits, absolute or changed by a delta.
 
-    Differs from its parent in two ways: a delta never winds the target up beyond a
-    joint's limit, and all that an action needs is computed once, where it can be.
+    Differs from its parent in three ways: a delta never winds the target up beyond a
+    joint's limit, all that an action needs is computed once, where it can be, and a
+    reset of the env leaves the targets of other envs, and those of a restored state.
     """
 
     config: PDJointPosControllerConfig
+    _stale: Tensor | None = None
+    """While the env is being reset: whose targets `reset` is to set anew [N] bool."""
 
     def _initialize_joints(self) -> None:
         super()._initialize_joints()
@@ -96,7 +99,8 @@ class TargetController(PDJointPosController):
         """
         targets = targets.clamp(self.lower, self.upper)
         if self.scene.gpu_sim_enabled:
-            super().set_drive_targets(targets)
+            # Of a batch ManiSkill takes the rows of the envs being reset alone.
+            super().set_drive_targets(targets[self.scene._reset_mask])
         else:
             angles = targets.tolist()[0]
             if math.isnan(sum(angles)):
@@ -107,9 +111,21 @@ class TargetController(PDJointPosController):
                 joint.set_drive_target(angle)
         self._target_qpos = targets
 
+    def begin_reset(self) -> None:
+        """Take note of the envs being reset, which ManiSkill forgets before `reset`."""
+        self._stale = self.scene._reset_mask.clone()
+
     def reset(self) -> None:
-        """Make the current positions the targets of the envs being reset."""
+        """Make the current positions the targets.
+
+        Within a reset of the env: of the envs being reset, unless `set_state` has
+        restored their targets since.
+        """
+        everyone = self.scene._reset_mask
+        if self._stale is not None:
+            self.scene._reset_mask, self._stale = self._stale, None
         super().reset()
+        self.scene._reset_mask = everyone
         self.set_drive_targets(self._target_qpos)
 
     def get_state(self) -> dict[str, Tensor]:
@@ -119,6 +135,8 @@ class TargetController(PDJointPosController):
     def set_state(self, state: dict[str, Tensor]) -> None:
         """Restore what `get_state` returned."""
         self.set_drive_targets(state["target_qpos"])
+        if self._stale is not None:
+            self._stale = torch.zeros_like(self._stale)
 
 
 @dataclass
@@ -202,6 +220,15 @@ class Robot(BaseAgent, ABC):
         return Keyframe(pose=sapien.Pose(), qpos=self.to_qpos(position).cpu().numpy())
 
     # -- Control ---------------------------------------------------------------------
+
+    def reset(self, init_qpos: Tensor | None = None) -> None:
+        """Bring the envs being reset to rest; ManiSkill's reset begins with it.
+
+        Args:
+            init_qpos: Joint positions to take, in the simulator's order [N, J] [rad].
+        """
+        super().reset(init_qpos)
+        self.controller.begin_reset()
 
     @property
     def _controller_configs(self) -> dict[str, TargetControllerConfig]:
