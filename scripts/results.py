@@ -13,7 +13,6 @@ nothing has been recorded for them.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -27,6 +26,7 @@ import numpy as np
 from ir_maniskill import experiment as catalog
 from ir_maniskill.training.config import CONFIGS, TrainConfig, decode, to_json
 from ir_maniskill.training.plots import Curve, compare
+from ir_maniskill.training.run_folder import whole_rows
 
 Figures = Mapping[str, Any]
 Cells = tuple[str, ...]
@@ -205,8 +205,7 @@ def kept(folder: Path = FOLDER) -> list[Run]:
 
 
 def _rows(table: Path) -> list[dict[str, float]]:
-    with table.open(newline="") as file:
-        return [{k: float(v) for k, v in row.items()} for row in csv.DictReader(file)]
+    return [{k: float(v) for k, v in row.items()} for row in whole_rows(table)]
 
 
 def _json(path: Path) -> dict[str, Any]:

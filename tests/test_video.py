@@ -187,6 +187,15 @@ def test_learning_curve_draws_a_run(tmp_path):
     assert not np.array_equal(imageio.imread(plots.learning_curve(tmp_path)), plain)
 
 
+def test_a_curve_leaves_out_a_row_that_a_kill_cut_short(tmp_path):
+    rows = [{"steps": 2048 * i, "train/return": i} for i in range(3)]
+    write_metrics(tmp_path, "metrics.csv", rows)
+    whole = imageio.imread(plots.learning_curve(tmp_path))
+    with (tmp_path / "metrics.csv").open("a") as file:
+        file.write("6144")
+    assert np.array_equal(imageio.imread(plots.learning_curve(tmp_path)), whole)
+
+
 def test_learning_curve_of_no_run_or_a_broken_one_says_so(tmp_path):
     with pytest.raises(plots.PlotError, match=r"no metrics.csv"):
         plots.learning_curve(tmp_path)

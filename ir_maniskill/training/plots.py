@@ -5,7 +5,6 @@ Legend: R runs, P points.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+from ir_maniskill.training.run_folder import whole_rows
 
 TRAINING = (
     ("train/success", "episodes touching the named object"),
@@ -49,8 +50,7 @@ def learning_curve(run: Path, out: Path | None = None) -> Path:
     metrics = _read(run / "metrics.csv")
     if not metrics:
         raise PlotError(f"{run}: got no metrics.csv with rows, expected a run's folder")
-    table = run / "evaluations.csv"
-    evaluations = _read(table) if table.exists() else []
+    evaluations = _read(run / "evaluations.csv")
     figure = Figure(figsize=(8.0, 5.6), dpi=150, layout="constrained")
     shares, returns = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
     _draw_shares(shares, metrics, evaluations)
@@ -162,12 +162,10 @@ def _draw_range(
 def _read(table: Path) -> list[dict[str, float]]:
     """Reads a table of numbers; [] if it is missing."""
     try:
-        with table.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
-        return [{k: float(v) for k, v in row.items()} for row in rows]
+        return [{k: float(v) for k, v in row.items()} for row in whole_rows(table)]
     except FileNotFoundError:
         return []
-    except (TypeError, ValueError) as error:
+    except ValueError as error:
         raise PlotError(f"{table}: got {error}, expected a table of numbers") from error
 
 

@@ -91,7 +91,7 @@ class RunFolder:
         table = self.path / f"{name}.csv"
         if not table.exists():
             return 0
-        rows = [row for row in _rows(table) if int(row["steps"]) <= steps]
+        rows = [row for row in whole_rows(table) if int(row["steps"]) <= steps]
         checkpoint.replace(table, _format(rows, header=True))
         return int(rows[-1]["steps"]) if rows else 0
 
@@ -163,7 +163,7 @@ def _undisturbed() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _rows(table: Path) -> list[dict[str, str]]:
+def whole_rows(table: Path) -> list[dict[str, str]]:
     """Return the rows of a CSV table but those that were cut short."""
     with table.open(newline="", errors="replace") as file:
         lines = [line for line in file if line.endswith("\n")]
