@@ -49,7 +49,7 @@ def actions(count: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-1, 1, (count, 26)).astype(np.float32)
 
 
-def trajectory(env: gym.Env, seed: int, steps: int = 12) -> list[dict]:
+def trajectory(env: gym.Env, seed: int | np.integer, steps: int = 12) -> list[dict]:
     """Return all observations of an episode under fixed actions."""
     seen = [leaves(env.reset(seed=seed)[0])]
     return seen + [leaves(env.step(action)[0]) for action in actions(steps)]
@@ -82,7 +82,7 @@ def numpy_of(obs: dict) -> dict:
 def test_a_seed_fixes_the_trajectory_whatever_came_before(env: gym.Env) -> None:
     first = trajectory(env, seed=7)
     other = trajectory(env, seed=8)
-    again = trajectory(env, seed=7)
+    again = trajectory(env, seed=np.int64(7))
     for a, b in zip(first, again, strict=True):
         assert all(torch.equal(a[path], b[path]) for path in a)
     key = "extra/object_position"
@@ -117,6 +117,8 @@ def test_the_sentence_its_tokens_and_its_object_belong_together(env: gym.Env) ->
         assert words == instruction.text.lower().replace(".", " .").split()
     with pytest.raises(ValueError, match="'instruction': got 3, expected indices 0 to"):
         env.reset(options={"instruction": 3})
+    with pytest.raises(ValueError, match=r"got \[0, 0\].* or one for each of 1: "):
+        env.reset(options={"instruction": [0, 0]})
 
 
 def test_an_episode_is_finite_and_ends_by_time_alone(env: gym.Env) -> None:

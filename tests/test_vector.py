@@ -128,10 +128,19 @@ def test_returned_tensors_are_not_overwritten_later(envs: ProcessVectorEnv) -> N
     assert torch.equal(obs["agent"]["proprioception"], before)
 
 
-def test_options_are_dealt_out_one_each(envs: ProcessVectorEnv) -> None:
-    wanted = torch.tensor([2, 0, 1])
-    obs, _ = envs.reset(seed=0, options={"instruction": wanted})
-    assert obs["extra"]["target_object"].argmax(1).tolist() == wanted.tolist()
+@pytest.mark.parametrize("form", [torch.tensor, np.array, list, tuple])
+def test_options_are_dealt_out_one_each(envs: ProcessVectorEnv, form: Any) -> None:
+    options = {"instruction": form([2, 0, 1]), "reconfigure": False}
+    obs, _ = envs.reset(seed=0, options=options)
+    assert obs["extra"]["target_object"].argmax(1).tolist() == [2, 0, 1]
+    obs, _ = envs.reset(options={"instruction": form([1, 1, 1])[0]})
+    assert obs["extra"]["target_object"].argmax(1).tolist() == [1, 1, 1]
+
+
+def test_seeds_may_be_those_of_numpy(flat: ProcessVectorEnv) -> None:
+    expected, _ = flat.reset(seed=[4, 5, 6])
+    for seed in (4, np.int64(4), np.arange(4, 7), torch.arange(4, 7)):
+        assert torch.equal(flat.reset(seed=seed)[0], expected)
 
 
 def test_attributes_are_set_for_all_or_one_each(envs: ProcessVectorEnv) -> None:
@@ -157,6 +166,9 @@ def test_wrong_shapes_are_refused(envs: ProcessVectorEnv) -> None:
         envs.step(torch.full((3, 26), torch.nan))
     with pytest.raises(ValueError, match="seeds: got 2, expected 3"):
         envs.reset(seed=[1, 2])
+    for wrong in (2, 4):
+        with pytest.raises(ValueError, match=f"'instruction': got {wrong} values, exp"):
+            envs.reset(options={"instruction": torch.zeros(wrong, dtype=int)})
     with pytest.raises(ValueError, match="options: got 'env_idx'"):
         envs.reset(options={"env_idx": torch.tensor([0])})
     with pytest.raises(ValueError, match="num_envs: got 0"):
@@ -303,12 +315,14 @@ def test_a_batch_on_a_gpu_is_seeded_alike(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(vector.gym, "make", lambda *_, **__: batch)
     envs = make_vec(TASK, 3, sim_backend="physx_cuda")
     some = {"env_idx": torch.tensor([1])}
-    envs.reset(seed=7)
+    envs.reset(seed=np.int64(7))
     envs.reset(seed=[5, 3, 4])
     envs.reset(options=some)
     assert resets == [([7, 8, 9], None), ([5, 3, 4], None), (None, some)]
     with pytest.raises(ValueError, match="seed: got 7 for some of the envs"):
         envs.reset(seed=7, options=some)
+    with pytest.raises(ValueError, match="seeds: got 2, expected 3"):
+        envs.reset(seed=[1, 2])
     envs.set_attr("dense_weights", "new")
     assert base.dense_weights == "new"
     with pytest.raises(ValueError, match="dense_weights: got 3 values, expected one"):

@@ -13,7 +13,7 @@ import os
 import signal
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.shared_memory import SharedMemory
@@ -210,7 +210,7 @@ class ProcessVectorEnv(VectorEnv):
     def reset(
         self,
         *,
-        seed: int | list[int] | None = None,
+        seed: int | Sequence[int] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Observation, Tree]:
         """Start a new episode in every env.
@@ -218,10 +218,12 @@ class ProcessVectorEnv(VectorEnv):
         Args:
             seed: Env i gets seed + i, or the i-th of a list; None goes on with each
                 env's own random stream, which begins with 2022 + i.
-            options: Passed to the envs; a tensor of N values is dealt out, one each.
+            options: Passed to the envs; a list, array or tensor of N values is dealt
+                out, one each.
 
         Raises:
-            ValueError: The list has not N seeds, or the options name some of the envs.
+            ValueError: There are not N seeds or values of an option, or the options
+                name some of the envs.
             WorkerError: A worker refused an option, failed, died or hangs; or it has
                 not answered the last command.
         """
@@ -232,15 +234,10 @@ class ProcessVectorEnv(VectorEnv):
             )
         if seed is None and not self._seeded:
             seed = FIRST_SEED
-        if isinstance(seed, int):
-            seed = list(range(seed, seed + self.num_envs))
-        seeds = seed if seed is not None else [None] * self.num_envs
-        if len(seeds) != self.num_envs:
-            raise ValueError(f"seeds: got {len(seeds)}, expected {self.num_envs}")
-        each = [_options_of(options, row) for row in range(self.num_envs)]
-        self._command(
-            "reset", [[(seeds[r], each[r]) for r in rows] for rows in self._rows]
-        )
+        count = self.num_envs
+        seeds = [None] * count if seed is None else seeds_of(seed, count)
+        each = list(zip(seeds, _deal(options or {}, count), strict=True))
+        self._command("reset", [[each[row] for row in rows] for rows in self._rows])
         self._seeded = True
         return self._shared.read("obs"), self._shared.read("info")
 
@@ -406,13 +403,38 @@ class ProcessVectorEnv(VectorEnv):
         )
 
 
-def _options_of(options: dict[str, Any] | None, row: int) -> dict[str, Any] | None:
-    if options is None:
-        return None
-    return {
-        name: int(value[row]) if isinstance(value, Tensor) and value.ndim else value
-        for name, value in options.items()
-    }
+def seeds_of(seed: int | Sequence[int], num_envs: int) -> list[int]:
+    """Return the seeds of N envs: seed + i, or those of a sequence.
+
+    Raises:
+        ValueError: The sequence has not N of them.
+    """
+    if isinstance(seed, int | np.integer):
+        return list(range(int(seed), int(seed) + num_envs))
+    if len(seed) != num_envs:
+        raise ValueError(f"seeds: got {len(seed)}, expected {num_envs}")
+    return [int(each) for each in seed]
+
+
+def _deal(options: dict[str, Any], num_envs: int) -> Iterator[dict[str, Any]]:
+    """Yield the options of each env: its own of N values, else what all get."""
+    values = {name: _values(name, given, num_envs) for name, given in options.items()}
+    for row in range(num_envs):
+        yield {name: value[row] for name, value in values.items()}
+
+
+def _values(name: str, given: Any, num_envs: int) -> list:
+    """Return each env's value of an option."""
+    if isinstance(given, Tensor | np.ndarray):
+        given = given.tolist()
+    if not isinstance(given, list | tuple):
+        return [given] * num_envs
+    if len(given) != num_envs:
+        raise ValueError(
+            f"reset option {name!r}: got {len(given)} values, expected {num_envs}, "
+            "one for each env, or a single one for all"
+        )
+    return list(given)
 
 
 class _Worker:

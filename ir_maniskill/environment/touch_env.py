@@ -189,15 +189,17 @@ class TouchEnv(BaseEnv):
         self._drawing = False
 
     def _choose_instruction(
-        self, env_idx: Tensor, uniform: np.ndarray, forced: int | Tensor | None
+        self, env_idx: Tensor, uniform: np.ndarray, forced: Any
     ) -> None:
         index = self.instructional_set.pick(self._tensor(uniform))
         if forced is not None:
-            index = torch.as_tensor(forced, device=self.device).expand(len(env_idx))
-            if not ((index >= 0) & (index < len(self.instructional_set))).all():
+            index = torch.as_tensor(forced, device=self.device)
+            in_range = (index >= 0) & (index < len(self.instructional_set))
+            if index.shape not in ((), env_idx.shape) or not in_range.all():
                 raise ValueError(
                     f"reset option 'instruction': got {forced}, expected indices 0 to "
-                    f"{len(self.instructional_set) - 1}: {self.experiment.sentences}"
+                    f"{len(self.instructional_set) - 1}, one for all envs or one for "
+                    f"each of {len(env_idx)}: {self.experiment.sentences}"
                 )
         self.instruction_index[env_idx] = index
 
@@ -236,9 +238,11 @@ class TouchEnv(BaseEnv):
                 an int or [b] int64, instead of drawing them.
 
         Raises:
-            ValueError: An instruction index is out of range.
+            ValueError: An instruction index is out of range, or there are not b.
         """
         options = dict(options or {})
+        if isinstance(seed, np.integer):
+            seed = int(seed)  # gymnasium and ManiSkill know no others
         if seed is not None and not self._sim_device.is_cuda():
             options.setdefault("reconfigure", True)
         gym.Env.reset(self, seed=seed if isinstance(seed, int) else None)

@@ -7,6 +7,7 @@ episode: an env that is done is reset in the same step, and `info` holds
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -14,7 +15,7 @@ import torch
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 from ir_maniskill import experiment as catalog
-from ir_maniskill.environment.process_vector import ProcessVectorEnv
+from ir_maniskill.environment.process_vector import ProcessVectorEnv, seeds_of
 
 
 def make_vec(
@@ -71,7 +72,7 @@ class GpuVectorEnv(ManiSkillVectorEnv):
         self.experiment = self.base_env.experiment
 
     def reset(
-        self, *, seed: int | list[int] | None = None, options: dict | None = None
+        self, *, seed: int | Sequence[int] | None = None, options: dict | None = None
     ) -> tuple[dict, dict]:
         """Start a new episode in all envs, or in b of them.
 
@@ -81,16 +82,16 @@ class GpuVectorEnv(ManiSkillVectorEnv):
             options: As for `TouchEnv.reset`, and "env_idx": which envs to reset [b].
 
         Raises:
-            ValueError: A seed together with "env_idx": ManiSkill would start the random
-                streams of the other envs anew, too.
+            ValueError: The list has not N seeds, or a seed comes with "env_idx":
+                ManiSkill would start the other envs' random streams anew, too.
         """
         if seed is not None and "env_idx" in (options or {}):
             raise ValueError(
                 f"seed: got {seed} for some of the envs, expected None with the option "
                 "'env_idx'; leave 'env_idx' out to seed all envs"
             )
-        if isinstance(seed, int):
-            seed = list(range(seed, seed + self.num_envs))
+        if seed is not None:
+            seed = seeds_of(seed, self.num_envs)
         return super().reset(seed=seed, options=options)
 
     def set_attr(self, name: str, values: Any) -> None:
