@@ -4,7 +4,8 @@
     python examples/evaluate_and_record.py --task NaoTouchCubeTriangle-v1
 
 Without a checkpoint the policy is one that acts at random: the figure to beat. Any
-function from the state s_t to actions in [-1, 1] can stand in its place.
+function from the state s_t to actions in [-1, 1] can stand in its place. The task is
+the one that the policy learned, unless another is named.
 """
 
 from pathlib import Path
@@ -30,7 +31,7 @@ def random_policy(state: dict[str, Tensor]) -> Tensor:
 
 def main(
     checkpoint: Path | None = None,
-    task: str = "NaoTouchCubeSingle-v1",
+    task: str | None = None,
     episodes: int = 30,
     films: int = 1,
     out: Path = Path("runs/evaluation"),
@@ -39,7 +40,8 @@ def main(
     policy, config = random_policy, CONFIGS["default"]
     if checkpoint is not None:
         agent, config, _ = load_policy(checkpoint)
-        policy, task = agent.policy, config.env_id
+        policy = agent.policy
+    task = task or config.env_id
     env_kwargs = config.env_kwargs(training=False)
     seed, frames = EVALUATION_SEED, config.frames
     report = evaluate_policy(

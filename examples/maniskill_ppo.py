@@ -90,7 +90,7 @@ def make(args: Args) -> ManiSkillVectorEnv:
         sensor_configs={"width": 32, "height": 64, "shader_pack": "unlit"},
     )
     env = FlattenRGBDObservationWrapper(env, rgb=True, depth=False, state=True)
-    return ManiSkillVectorEnv(env, ignore_terminations=True, record_metrics=True)
+    return ManiSkillVectorEnv(env, ignore_terminations=True)
 
 
 @torch.no_grad()

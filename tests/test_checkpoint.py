@@ -78,7 +78,10 @@ def test_configs_survive_json(name):
         ({"seed": True}, "seed: got True"),
         ({"agent": 3}, "AgentConfig: got 3, expected an object"),
         ({"num_envs": 7}, "num_envs: got 7, expected a divisor of 64"),
-        ({"stop_at_success": 1.5}, "stop_at_success: got 1.5, expected 0 to 1"),
+        (
+            {"stop_at_success": 0.0},
+            "stop_at_success: got 0.0, expected more than 0, at most 1, or None",
+        ),
         ({"reward_mode": "none"}, "reward_mode: got 'none'.*'dense'"),
         ({"control_mode": "pd_ee"}, "control_mode: got 'pd_ee'.*'pd_joint_pos'"),
         ({"eval_seed": 2**29}, "eval_seed: got 536870912, expected 0 to"),

@@ -58,10 +58,14 @@ def overhead(made: Trainer, updates: int = 1) -> Measure:
     is that of acting and of an update less the gathering of its minibatches.
     """
     watch = Stopwatch()
-    watch.watch(made.envs, "step", "simulation")
-    watch.watch(made.agent, "act", "acting")
-    watch.watch(made.agent, "value", "acting")
-    watch.watch(made.rollout, "batch", "gathering minibatches")
+    watched = (
+        (made.envs, "step", "simulation"),
+        (made.agent, "act", "acting"),
+        (made.agent, "value", "acting"),
+        (made.rollout, "batch", "gathering minibatches"),
+    )
+    for owner, method, name in watched:
+        watch.watch(owner, method, name)
     with _update_watched(watch):
         for _ in range(updates):
             with watch.part("other"):
@@ -69,12 +73,7 @@ def overhead(made: Trainer, updates: int = 1) -> Measure:
     total = sum(watch.seconds.values())
     share = {name: part / total for name, part in watch.seconds.items()}
     spent = ("simulation", "acting", "updating")
-    for owner, method in (
-        (made.envs, "step"),
-        (made.agent, "act"),
-        (made.agent, "value"),
-        (made.rollout, "batch"),
-    ):
+    for owner, method, _ in watched:
         delattr(owner, method)
     return Measure(
         "training_overhead",

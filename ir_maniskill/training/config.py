@@ -237,7 +237,9 @@ class TrainConfig:
         fits = rollouts % self.num_envs == 0
         _require(fits, "num_envs", self.num_envs, f"a divisor of {rollouts} rollouts")
         goal = self.stop_at_success
-        _require(goal is None or 0 < goal <= 1, "stop_at_success", goal, "0 to 1")
+        fits = goal is None or 0 < goal <= 1
+        expected = "more than 0, at most 1, or None"
+        _require(fits, "stop_at_success", goal, expected)
 
     @property
     def steps_per_env(self) -> int:

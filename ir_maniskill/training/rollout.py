@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ir_maniskill.agent.agent import Act, Agent, State
+from ir_maniskill.environment.state import StateStack
 from ir_maniskill.environment.vector import VectorEnv
 from ir_maniskill.training import distributed
 from ir_maniskill.training.config import PPOConfig
@@ -259,7 +260,7 @@ def to(state: State, device: torch.device) -> State:
 @torch.no_grad()
 def collect(
     envs: VectorEnv,
-    stack: Any,
+    stack: StateStack,
     state: State,
     agent: Agent,
     rollout: Rollout,

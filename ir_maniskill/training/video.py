@@ -248,15 +248,13 @@ def _label_cameras(canvas: ImageDraw.ImageDraw, pictures: Sequence[np.ndarray]) 
         canvas.text((x + width, y - 10), size, DIM, _font(12), anchor="rs")
 
 
+@cache
 def _mask(width: int, height: int, radius: int) -> Image.Image:
     """A rounded rectangle, drawn large and shrunk for smooth corners."""
     large = Image.new("L", (4 * width, 4 * height))
     area = (0, 0, 4 * width - 1, 4 * height - 1)
     ImageDraw.Draw(large).rounded_rectangle(area, 4 * radius, 255)
     return large.resize((width, height), Image.Resampling.LANCZOS)
-
-
-_cached_mask = cache(_mask)
 
 
 def _paste(page: Image.Image, array: np.ndarray, box: Box, radius: int) -> None:
@@ -271,14 +269,12 @@ def _paste(page: Image.Image, array: np.ndarray, box: Box, radius: int) -> None:
         picture = picture.resize(size, method)
         left, top = (size[0] - width) // 2, (size[1] - height) // 2
         picture = picture.crop((left, top, left + width, top + height))
-    page.paste(picture, (x, y), _cached_mask(width, height, radius))
+    page.paste(picture, (x, y), _mask(width, height, radius))
 
 
 def _paste_shape(page: Image.Image, box: Box, color: Color, radius: int) -> None:
     x, y, width, height = box
-    page.paste(
-        color, (x, y, x + width, y + height), _cached_mask(width, height, radius)
-    )
+    page.paste(color, (x, y, x + width, y + height), _mask(width, height, radius))
 
 
 def _draw_timeline(canvas: ImageDraw.ImageDraw, snapshot: Snapshot) -> None:
