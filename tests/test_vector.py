@@ -173,6 +173,11 @@ def test_wrong_shapes_are_refused(envs: ProcessVectorEnv) -> None:
         envs.reset(options={"env_idx": torch.tensor([0])})
     with pytest.raises(ValueError, match="num_envs: got 0"):
         make_vec(TASK, 0)
+    for wrong in (0, -1):
+        with pytest.raises(ValueError, match=f"num_workers: got {wrong}, expected at "):
+            make_vec(TASK, 2, num_workers=wrong)
+    with pytest.raises(ValueError, match="sim_backend: got 'gpus', expected 'auto' or"):
+        make_vec(TASK, 2, sim_backend="gpus")
     with pytest.raises(catalog.UnknownExperimentError, match="available"):
         make_vec("NoSuchTask-v1", 1)
 
@@ -294,6 +299,14 @@ def test_workers_end_when_the_parent_is_killed() -> None:
     while any(map(alive, workers)) and time.monotonic() < deadline:
         time.sleep(0.2)
     assert not any(map(alive, workers))
+
+
+@pytest.mark.parametrize("backend", ["gpu", "cuda", "cuda:0", "physx_cuda:0"])
+def test_every_name_of_the_gpu_means_the_gpu(
+    backend: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(vector, "GpuVectorEnv", lambda *_, sim_backend: sim_backend)
+    assert make_vec(TASK, 3, sim_backend=backend) == backend
 
 
 def test_a_batch_on_a_gpu_is_seeded_alike(monkeypatch: pytest.MonkeyPatch) -> None:

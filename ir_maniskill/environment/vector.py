@@ -12,6 +12,7 @@ from typing import Any
 
 import gymnasium as gym
 import torch
+from mani_skill.envs.utils.system.backend import sim_backend_name_mapping
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 from ir_maniskill import experiment as catalog
@@ -34,21 +35,23 @@ def make_vec(
         num_envs: Number of envs N.
         num_workers: Worker processes on the CPU; None is one per core.
         timeout: How long a worker process may take for one command [s].
-        sim_backend: "physx_cuda" (one process, batched), "physx_cpu" (processes), or
+        sim_backend: "physx_cuda" (one process, batched; ":0" behind it names a
+            device), "physx_cpu" (processes), ManiSkill's other names of these, or
             "auto": CUDA where torch sees a device, else processes.
         **env_kwargs: As for `gym.make(task_id)`.
 
     Raises:
         UnknownExperimentError: There is no task of that id.
-        ValueError: A number is out of range.
+        ValueError: A number is out of range, or there is no such backend.
         WorkerError: A worker process failed to start its envs.
     """
     experiment = catalog.get(task_id)
-    if num_envs < 1:
-        raise ValueError(f"num_envs: got {num_envs}, expected at least 1")
+    for name, number in (("num_envs", num_envs), ("num_workers", num_workers)):
+        if number is not None and number < 1:
+            raise ValueError(f"{name}: got {number}, expected at least 1")
     if sim_backend == "auto":
         sim_backend = "physx_cuda" if torch.cuda.is_available() else "physx_cpu"
-    if sim_backend.startswith("physx_cuda"):
+    if _simulator(sim_backend) == "physx_cuda":
         return GpuVectorEnv(task_id, num_envs, sim_backend=sim_backend, **env_kwargs)
     return ProcessVectorEnv(
         experiment,
@@ -57,6 +60,18 @@ def make_vec(
         env_kwargs=env_kwargs,
         timeout=timeout,
     )
+
+
+def _simulator(sim_backend: str) -> str:
+    """Return the first of ManiSkill's names of a backend, without the device."""
+    kind, _, _ = sim_backend.partition(":")
+    if kind not in sim_backend_name_mapping:
+        raise ValueError(
+            f"sim_backend: got {sim_backend!r}, expected 'auto' or one of "
+            f"{', '.join(sim_backend_name_mapping)}, with a device if need be "
+            "('cuda:0')"
+        )
+    return sim_backend_name_mapping[kind]
 
 
 class GpuVectorEnv(ManiSkillVectorEnv):
