@@ -158,9 +158,10 @@ def require_vulkan() -> None:
         remedy, advice = prescribe(read_os_release())
         todo = "\n".join(filter(None, (advice, *remedy)))
         raise RuntimeError(
-            f"SAPIEN can not render here: got '{error}'; expected a Vulkan device "
+            f"SAPIEN cannot render here: got '{error}'; expected a Vulkan device "
             "(a GPU's, or Mesa's lavapipe from 24.3 on). `ir-maniskill doctor` tells "
-            f"more. What to do:\n{todo}"
+            "more. To go without pictures, make the env with render_backend='none' and "
+            f"obs_mode 'state' or 'state_dict'. To render:\n{todo}"
         ) from error
 
 

@@ -366,4 +366,4 @@ def test_without_vulkan_there_is_one_clear_error_and_state_modes_work() -> None:
         check=True,
     )
     assert "expected a Vulkan device" in done.stdout
-    assert "What to do:" in done.stdout
+    assert "To render:" in done.stdout
