@@ -1,8 +1,10 @@
 """The benchmark: its arithmetic, and that its blocks do what they are named for."""
 
+import itertools
 import json
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -52,6 +54,29 @@ def test_stopwatch_watches_a_method():
     watch.watch(worker, "work", "working")
     assert worker.work(3) == 6
     assert watch.seconds["working"] > 0
+
+
+def test_the_profile_leaves_resets_out(monkeypatch):
+    def work(*_):
+        pass
+
+    scene = SimpleNamespace(step=work, update_render=work, sensors={})
+    agent = SimpleNamespace(set_action=work)
+    names = "evaluate get_reward _contact_force _get_obs_agent _get_obs_extra"
+    methods = dict.fromkeys([*names.split(), "_fetch_color"], work)
+    base = SimpleNamespace(scene=scene, agent=agent, **methods)
+    env = SimpleNamespace(
+        unwrapped=base,
+        reset=lambda: base.evaluate(),
+        step=lambda _: base.evaluate(),
+        close=work,
+    )
+    monkeypatch.setattr(simulation, "make", lambda *_: env)
+    monkeypatch.setattr(simulation, "actions", lambda _, steps: range(steps))
+    clock = itertools.count(0.0)  # a second passes between two looks
+    monkeypatch.setattr(time, "perf_counter", lambda: next(clock))
+    found = simulation.profile("trivial", seconds=0)
+    assert found == {"Python, all the rest": 2.0, "what contacts mean": 1.0}
 
 
 def test_measures_know_whether_the_goal_is_reached():

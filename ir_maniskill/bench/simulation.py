@@ -229,15 +229,13 @@ def profile(shader: str, seconds: float) -> dict[str, float]:
 
         def block() -> float:
             nonlocal steps
+            before = dict(watch.seconds)
             env.reset()
-            kept, watch.seconds = watch.seconds, {}
+            watch.seconds = before  # a reset is no part of a step
             for action in plan:
                 with watch.part("Python, all the rest"):
                     env.step(action)
             steps += EPISODE
-            part = watch.seconds
-            names = kept.keys() | part.keys()
-            watch.seconds = {k: kept.get(k, 0) + part.get(k, 0) for k in names}
             return 0.0
 
         block()
