@@ -9,6 +9,8 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from toy_envs import LENGTH, SENTENCES, ToyVectorEnv, toy_config
 
+import ir_maniskill
+from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.reward_generator import DenseWeights
 from ir_maniskill.training import checkpoint
 from ir_maniskill.training import train as training
@@ -260,6 +262,20 @@ def test_a_folder_with_a_run_is_not_overwritten(tmp_path):
 def test_envs_that_are_not_the_configs_are_refused(tmp_path, envs, message):
     with pytest.raises(ConfigError, match=message):
         train(toy_config(tmp_path), envs=envs)
+
+
+def test_senses_left_to_the_experiment_decide_what_the_envs_give(tmp_path, monkeypatch):
+    blind = dataclasses.replace(
+        catalog.get("NaoTouchCubeSingle-v1"), id="Blind-v1", senses=("touch",)
+    )
+    ir_maniskill.register(blind)
+    made = []
+    monkeypatch.setattr(training, "make_vec", lambda *_, **kwargs: made.append(kwargs))
+    config = toy_config(tmp_path, env_id="Blind-v1")
+    senseless = dataclasses.replace(config.agent, senses=None)
+    with pytest.raises(AttributeError):  # there are no envs
+        train(dataclasses.replace(config, agent=senseless))
+    assert made[0]["obs_mode"] == "state_dict"
 
 
 def test_too_few_episodes_for_the_sentences_are_refused_before_training(tmp_path):

@@ -13,8 +13,9 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from ir_maniskill.agent.agent import Agent, State, StateSpec
-from ir_maniskill.environment.state import StateStack
+from ir_maniskill import experiment as catalog
+from ir_maniskill.agent.agent import Agent, StateSpec
+from ir_maniskill.environment.state import State, StateStack
 from ir_maniskill.environment.vector import VectorEnv, make_vec
 from ir_maniskill.experiment import Experiment
 from ir_maniskill.training import checkpoint, distributed, ppo
@@ -67,7 +68,8 @@ def train(
         leaving.callback(folder.close)
         leaving.callback(torch.set_num_threads, torch.get_num_threads())
         if envs is None:
-            envs = _make_envs(config)
+            experiment = catalog.get(config.env_id)
+            envs = _make_envs(_for_experiment(config, experiment))
             leaving.callback(envs.close)
         _require_fit(config, envs)
         trainer = Trainer(config, envs, folder)
