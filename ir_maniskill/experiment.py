@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from numbers import Integral, Real
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 VOCABULARY = (
     "<pad>",
@@ -27,6 +27,9 @@ VOCABULARY = (
     "button",
 )
 """The ten tokens of the paper's vocabulary; a token's id is its place here."""
+
+PAD, UNK = 0, 1
+"""Ids of `<pad>`, which fills short sentences up, and of `<unk>`, any other word."""
 
 COLORS: dict[str, tuple[float, float, float]] = {
     "blue": (0.05, 0.16, 0.85),
@@ -171,7 +174,7 @@ class Experiment:
             ExperimentError: Some field is malformed; the message says which.
         """
         _check_id(self.id)
-        _check_choice("reward", self.reward, ("binary", "per_finger"))
+        _check_choice("reward", self.reward, get_args(RewardKind))
         _check_number("wrong_penalty", self.wrong_penalty, 0, 10)
         _check_number("episode_steps", self.episode_steps, 1, 10_000, Integral)
         _check_type("jitter", self.jitter, Jitter)
@@ -204,16 +207,11 @@ class Experiment:
                 f"expected {VOCABULARY[:2]!r}"
             )
         for index, word in enumerate(self.vocabulary[2:], start=2):
-            if self._tokens(word) != (index,):
+            if tokenize(word, self.vocabulary) != [index]:
                 raise ExperimentError(
                     f"vocabulary: got {word!r}, expected words in lower case and "
                     "full stops, no two alike"
                 )
-
-    def _tokens(self, sentence: str) -> tuple[int, ...]:
-        from ir_maniskill.environment.instructional_set import tokenize  # imports this
-
-        return tuple(tokenize(sentence, self.vocabulary))
 
     def _check_instructions(self) -> None:
         names = [thing.name for thing in self.objects]
@@ -227,7 +225,7 @@ class Experiment:
         for instruction in self.instructions:
             _check_choice("instruction target", instruction.target, names)
             _check_type("instruction text", instruction.text, str)
-            tokens = self._tokens(instruction.text)
+            tokens = tuple(tokenize(instruction.text, self.vocabulary))
             if not tokens:
                 raise ExperimentError(
                     f"instruction text: got {instruction.text!r}, an empty sentence"
@@ -264,6 +262,18 @@ class Experiment:
                     f"{gap:.3f} m with jitter, expected at least "
                     f"{OBJECT_SIZE * math.sqrt(2):.3f} m"
                 )
+
+
+def tokenize(sentence: str, vocabulary: tuple[str, ...] = VOCABULARY) -> list[int]:
+    """Split a sentence into words and full stops and return their ids.
+
+    Args:
+        sentence: Any text; case does not matter, unknown words become `<unk>`.
+        vocabulary: The known tokens; an id is a place in it.
+    """
+    words = re.findall(r"[^\W_]+|\.", sentence.lower())
+    ids = {word: index for index, word in enumerate(vocabulary)}
+    return [ids.get(word, UNK) for word in words]
 
 
 def touch_instructions(objects: Iterable[TouchObject]) -> tuple[Instruction, ...]:

@@ -7,13 +7,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ir_maniskill import experiment as catalog
-from ir_maniskill.environment.instructional_set import (
+from ir_maniskill.environment.instructional_set import InstructionalSet
+from ir_maniskill.experiment import (
     PAD,
     UNK,
-    InstructionalSet,
+    VOCABULARY,
+    Experiment,
+    Instruction,
+    TouchObject,
     tokenize,
 )
-from ir_maniskill.experiment import VOCABULARY, Experiment, Instruction, TouchObject
 
 CPU = torch.device("cpu")
 

@@ -12,9 +12,8 @@ from ir_maniskill.agent.alignment import Alignment
 from ir_maniskill.agent.critic import Critic, Standardize
 from ir_maniskill.agent.language_system import LanguageSystem
 from ir_maniskill.agent.perceptual_system import BodySense, PaperVision, PatchVision
+from ir_maniskill.environment.state import State
 from ir_maniskill.training.config import AgentConfig
-
-State = dict[str, Tensor]
 
 
 @dataclass(frozen=True)

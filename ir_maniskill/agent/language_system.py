@@ -4,8 +4,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-PAD = 0
-"""Token id that fills short sentences up to L."""
+from ir_maniskill.experiment import PAD
 
 
 class EncoderLayer(nn.Module):

@@ -2,26 +2,10 @@
 
 from __future__ import annotations
 
-import re
-
 import torch
 from torch import Tensor
 
-from ir_maniskill.experiment import VOCABULARY, Experiment
-
-PAD, UNK = 0, 1
-
-
-def tokenize(sentence: str, vocabulary: tuple[str, ...] = VOCABULARY) -> list[int]:
-    """Split a sentence into words and full stops and return their ids.
-
-    Args:
-        sentence: Any text; case does not matter, unknown words become `<unk>`.
-        vocabulary: The known tokens; an id is a place in it.
-    """
-    words = re.findall(r"[^\W_]+|\.", sentence.lower())
-    ids = {word: index for index, word in enumerate(vocabulary)}
-    return [ids.get(word, UNK) for word in words]
+from ir_maniskill.experiment import PAD, Experiment, tokenize
 
 
 class InstructionalSet:

@@ -15,6 +15,7 @@ STACKED = ("images", "proprioception", "target", "touch")
 """What is stacked; the instruction is constant within an episode."""
 
 State = dict[str, Tensor]
+"""s_t of N envs; `flatten` and `StateStack` tell what it holds."""
 
 
 def flatten(obs: dict) -> State:

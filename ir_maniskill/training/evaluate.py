@@ -24,10 +24,10 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from ir_maniskill.environment.state import StateStack
+from ir_maniskill.environment.state import State, StateStack
 from ir_maniskill.environment.vector import VectorEnv, make_vec
 
-Policy = Callable[[dict[str, Tensor]], Tensor]
+Policy = Callable[[State], Tensor]
 """Maps the state s_t of N envs to their actions [N, 26] in [-1, 1]."""
 
 EVALUATION_SEED = 2_000_000
@@ -444,7 +444,7 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _act(policy: Policy, state: dict[str, Tensor], device: torch.device) -> Tensor:
+def _act(policy: Policy, state: State, device: torch.device) -> Tensor:
     """Return the actions [N, 26], on the CPU computed for one env after another.
 
     How a matrix product is rounded depends on the number of rows, and contacts make

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ir_maniskill.agent.agent import Act, Agent, State
-from ir_maniskill.environment.state import StateStack
+from ir_maniskill.agent.agent import Act, Agent
+from ir_maniskill.environment.state import State, StateStack
 from ir_maniskill.environment.vector import VectorEnv
 from ir_maniskill.training import distributed
 from ir_maniskill.training.config import PPOConfig

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import os
 import tempfile
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from mani_skill.agents.registration import register_agent
 
+from ir_maniskill.assets.nao import URDF_PATH
 from ir_maniskill.environment.robot.nao_urdf import adapt
 from ir_maniskill.environment.robot.robot import JointGroup, Robot
 
@@ -73,7 +73,7 @@ UPPER_ARM = ("Shoulder", "Bicep", "Elbow")
 
 # -- The robot -----------------------------------------------------------------------
 
-OUR_URDF = str(files("ir_maniskill.assets") / "nao" / "nao.urdf")
+OUR_URDF = str(URDF_PATH)
 """The model that ships with the package."""
 URDF_VARIABLE = "IR_MANISKILL_NAO_URDF"
 """Environment variable that names a NAO URDF to use instead of ours."""
