@@ -25,7 +25,7 @@ def make_state(n=4, height=64, width=32, privileged=50):
         "target": torch.rand(n, 3, 26, generator=generator),
         "touch": torch.ones(n, 3, 6),
         "privileged": torch.rand(n, privileged, generator=generator),
-        "target_position": torch.rand(n, 3, generator=generator),
+        "named_position": torch.rand(n, 3, generator=generator),
     }
     state["instruction"][:, -1] = 0
     return state
@@ -207,9 +207,9 @@ def test_the_auxiliary_head_exists_only_if_its_loss_counts():
     state = make_state()
     action = torch.zeros(4, ACTIONS)
     with_head = make_agent(state, auxiliary_weight=0.1)
-    assert with_head.evaluate_actions(state, action).target_position.shape == (4, 3)
+    assert with_head.evaluate_actions(state, action).named_position.shape == (4, 3)
     without = make_agent(state, auxiliary_weight=0.0)
-    assert without.evaluate_actions(state, action).target_position is None
+    assert without.evaluate_actions(state, action).named_position is None
 
 
 def test_the_policy_is_noiseless_and_within_bounds():

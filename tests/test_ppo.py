@@ -175,7 +175,7 @@ def test_policy_loss_is_clipped_by_hand():
 def test_value_entropy_and_auxiliary_losses_by_hand():
     agent = judged([0.0, 0.0], value=[1.0, 3.0], target=torch.full((2, 3), 0.3))
     config = PPOConfig(value_weight=0.5, entropy_weight=0.1)
-    place = {"target_position": torch.full((2, 3), 0.1)}
+    place = {"named_position": torch.full((2, 3), 0.1)}
     loss, terms = ppo.ppo_loss(
         agent, batch_of([1.0, -1.0], (0.0, 0.0), **place), config
     )

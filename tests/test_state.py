@@ -81,4 +81,4 @@ def test_the_simulators_state_is_there_only_when_asked_for() -> None:
     assert "privileged" not in flatten(observation(1))
     state = flatten(observation(1, 2, privileged=True))
     assert state["privileged"].shape == (2, 26 + 9 + 18 + 3 + 1)
-    assert state["target_position"].tolist() == [[3.0, 4.0, 5.0]] * 2
+    assert state["named_position"].tolist() == [[3.0, 4.0, 5.0]] * 2

@@ -77,7 +77,7 @@ class Judgement(NamedTuple):
     log_prob: Tensor  # [N]
     entropy: Tensor  # [N]
     value: Tensor  # [N]
-    target_position: Tensor | None  # [N,3] [m], where the named object is thought to be
+    named_position: Tensor | None  # [N,3] [m], where the named object is thought to be
 
 
 class StateEncoder(nn.Module):

@@ -27,7 +27,7 @@ def flatten(obs: dict) -> State:
     Returns:
         `instruction` [N, L], `proprioception` and `target` [N, J], `touch` [N, F];
         `images` [N, K, H, W, 3] if there are pictures; `privileged` [N, P] and
-        `target_position` [N, 3] [m] if the simulator's state is there.
+        `named_position` [N, 3] [m] if the simulator's state is there.
     """
     agent, extra = obs["agent"], obs["extra"]
     state = {
@@ -46,7 +46,7 @@ def flatten(obs: dict) -> State:
             extra[key] for key in ("finger_position", "target_object", "wrong_once")
         ]
         state["privileged"] = torch.cat([part.flatten(1) for part in parts], dim=1)
-        state["target_position"] = (positions * chosen[..., None]).sum(dim=1)
+        state["named_position"] = (positions * chosen[..., None]).sum(dim=1)
     return state
 
 

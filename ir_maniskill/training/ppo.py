@@ -99,8 +99,8 @@ def ppo_loss(
     }
     loss = terms["policy"] + config.value_weight * terms["value"]
     loss = loss - config.entropy_weight * terms["entropy"]
-    if now.target_position is not None:
-        error = (now.target_position - batch.state["target_position"]) / DECIMETER
+    if now.named_position is not None:
+        error = (now.named_position - batch.state["named_position"]) / DECIMETER
         terms["auxiliary"] = error.square().mean()
         loss = loss + agent.config.auxiliary_weight * terms["auxiliary"]
     terms["kl"] = (ratio - 1 - log_ratio).mean()  # low-variance estimate, never < 0
