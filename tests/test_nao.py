@@ -2,13 +2,15 @@
 
 import math
 from collections.abc import Iterator
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 
-from ir_maniskill.environment.robot.nao import FINGERS, JOINTS
+from ir_maniskill.environment.robot.nao import FINGERS, JOINTS, Nao
+from ir_maniskill.environment.robot.robot import Robot, RobotError
 from ir_maniskill.environment.touch_env import TouchEnv
 
 ABSOLUTE, DELTA = "pd_joint_pos", "pd_joint_target_delta_pos"
@@ -129,6 +131,27 @@ def test_a_reset_of_other_envs_leaves_the_targets(env: TouchEnv) -> None:
     env.scene._reset_mask = everyone
     env.agent.controller.reset()
     assert torch.equal(env.agent.controller.target, wanted)
+
+
+def test_joints_without_a_motors_limits_are_named(tmp_path: Path) -> None:
+    urdf = tmp_path / "stick.urdf"
+    urdf.write_text(
+        '<robot name="stick"><link name="base"/><link name="tip"/>'
+        '<joint name="slide" type="prismatic"><parent link="base"/><child link="tip"/>'
+        '<limit lower="0" upper="1"/></joint></robot>'
+    )
+
+    class Stick(Nao):
+        uid, urdf_path, joints = "stick", str(urdf), ("slide",)
+        _load_articulation = Robot._load_articulation
+
+    with pytest.raises(RobotError, match="in slide; .* position, effort and velocity"):
+        gym.make(
+            "NaoTouchButtonTriangle-v1",
+            robot_uids=Stick,
+            obs_mode="state",
+            render_backend="none",
+        )
 
 
 def test_drives_have_the_real_motors_limits(env: TouchEnv) -> None:

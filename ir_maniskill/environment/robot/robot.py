@@ -189,7 +189,7 @@ class Robot(BaseAgent, ABC):
             raise RobotError(
                 f"joints of the robot {self.uid!r}: its class and {self.urdf_path} "
                 f"differ in {', '.join(wrong)}; expected `joints` to name all that "
-                "move, each with a limit in the file"
+                "move, each with a limit of position, effort and velocity in the file"
             )
 
     def _after_init(self) -> None:
@@ -337,7 +337,7 @@ def _actuator_limits(urdf_path: str) -> tuple[dict[str, float], dict[str, float]
     effort, speed = {}, {}
     for joint in ElementTree.parse(urdf_path).iter("joint"):
         limit = joint.find("limit")
-        if limit is not None:
+        if limit is not None and {"effort", "velocity"} <= limit.attrib.keys():
             effort[joint.attrib["name"]] = float(limit.attrib["effort"])
             speed[joint.attrib["name"]] = float(limit.attrib["velocity"])
     return effort, speed
