@@ -41,7 +41,7 @@ FILMS = (
 
 
 def shoot(task: str, size: tuple[int, int]) -> tuple[Image.Image, list[Image.Image]]:
-    """Returns the human view of a task's start, and what the two cameras see."""
+    """Return the human view of a task's start, and what the two cameras see."""
     width, height = size
     camera = {
         "width": 2 * width,  # drawn large and shrunk, for smooth edges
@@ -67,14 +67,14 @@ def shoot(task: str, size: tuple[int, int]) -> tuple[Image.Image, list[Image.Ima
 
 
 def label(page: Image.Image, place: tuple[int, int], text: str, size: int) -> None:
-    """Writes text onto the page, its left middle at `place`."""
+    """Write text onto the page, its left middle at `place`."""
     font: Any = ImageFont.load_default(size)
     ink = INK if size > 20 else FAINT
     ImageDraw.Draw(page).text(place, text, ink, font, anchor="lm")
 
 
 def hero() -> Image.Image:
-    """Returns the triangle scene beside what the policy sees of it."""
+    """Return the triangle scene beside what the policy sees of it."""
     view, eyes = shoot("NaoTouchCubeTriangle-v1", (832, 512))
     page = Image.new("RGB", (GAP + 832 + 2 * (GAP + 256) + GAP, 64 + 512 + GAP), PAGE)
     label(page, (GAP, 32), "“Touch the blue cube.”", 26)
@@ -87,7 +87,7 @@ def hero() -> Image.Image:
 
 
 def scenes() -> Image.Image:
-    """Returns the four layouts in a row."""
+    """Return the four layouts in a row."""
     tasks = [
         f"NaoTouch{shape}{layout}-v1"
         for layout in ("Multi", "Triangle")
@@ -103,17 +103,19 @@ def scenes() -> Image.Image:
 
 
 def save(make: Callable[[], Image.Image], path: Path) -> None:
-    """Writes a picture, small."""
+    """Write a picture, small."""
     page = make().quantize(256, dither=Image.Dither.FLOYDSTEINBERG)
     page.save(path, optimize=True)
 
 
 def film(task: str, path: Path) -> None:
-    """Writes a film of the shipped policy, told every sentence in the same scene."""
+    """Write a film of the shipped policy, told every sentence in the same scene."""
     folder = Path(str(files("ir_maniskill.assets") / "policies"))
     agent, config, _ = load_policy(folder / f"{task}.safetensors")
     play = partial(
-        *(record, agent.policy, task),
+        record,
+        agent.policy,
+        task,
         episodes=1,
         seed=EVALUATION_SEED,
         frames=config.frames,
@@ -124,7 +126,7 @@ def film(task: str, path: Path) -> None:
 
 
 def main() -> None:
-    """Writes what is asked for."""
+    """Write what is asked for."""
     pictures = {"nao": partial(save, hero), "tasks": partial(save, scenes)}
     films = {task: partial(film, task) for task in FILMS}
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])

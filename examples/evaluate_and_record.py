@@ -25,7 +25,7 @@ from ir_maniskill.training.video import record, write_video
 
 
 def random_policy(state: dict[str, Tensor]) -> Tensor:
-    """Returns random actions [N, 26]."""
+    """Return random actions [N, 26]."""
     return 2 * torch.rand(len(state["instruction"]), 26) - 1
 
 
@@ -36,7 +36,7 @@ def main(
     films: int = 1,
     out: Path = Path("runs/evaluation"),
 ) -> None:
-    """Evaluates, prints the figures, and writes report.json and video.mp4."""
+    """Evaluate, print the figures, and write report.json and video.mp4."""
     policy, config = random_policy, CONFIGS["default"]
     if checkpoint is not None:
         agent, config, _ = load_policy(checkpoint)

@@ -66,21 +66,21 @@ class Agent(nn.Module):
         self.log_std = nn.Parameter(torch.full_like(self.actor.bias, -0.7))
 
     def read(self, obs: Obs) -> Tensor:
-        """Returns the features of pictures, body and sentence [N, 256]."""
+        """Return the features of pictures, body and sentence [N, 256]."""
         seen = self.vision(obs["rgb"].permute(0, 3, 1, 2) / 255 - 0.5)
         body, tokens = obs["state"].tensor_split([-self.tokens], dim=1)
         words = nn.functional.one_hot(tokens.long(), self.vocabulary).flatten(1)
         return self.trunk(torch.cat([seen, body, words], dim=1))
 
     def forward(self, obs: Obs) -> tuple[Normal, Tensor]:
-        """Returns the distribution of actions [N, A] and the values [N]."""
+        """Return the distribution of actions [N, A] and the values [N]."""
         features = self.read(obs)
         policy = Normal(self.actor(features), self.log_std.exp())
         return policy, self.critic(features)[:, 0]
 
 
 def make(args: Args) -> ManiSkillVectorEnv:
-    """Makes the envs, flattened and starting anew by themselves."""
+    """Make the envs, flattened and starting anew by themselves."""
     env = gym.make(
         args.task,
         num_envs=args.num_envs,
@@ -95,7 +95,7 @@ def make(args: Args) -> ManiSkillVectorEnv:
 
 @torch.no_grad()
 def collect(envs: ManiSkillVectorEnv, agent: Agent, obs: Obs, args: Args) -> tuple:
-    """Returns the steps as a dict of [T, N, ...], the next observation, successes."""
+    """Return the steps as a dict of [T, N, ...], the next observation, successes."""
     steps, success = [], []
     for _ in range(args.steps):
         policy, value = agent(obs)
@@ -115,7 +115,7 @@ def collect(envs: ManiSkillVectorEnv, agent: Agent, obs: Obs, args: Args) -> tup
 
 
 def advantages(batch: dict[str, Tensor], args: Args) -> Tensor:
-    """Returns the generalized advantage estimates [T, N]."""
+    """Return the generalized advantage estimates [T, N]."""
     delta = batch["reward"] + args.gamma * batch["next_value"] - batch["value"]
     goes_on = (~batch["done"]).float() * args.gamma * args.gae_lambda
     advantage, last = torch.zeros_like(delta), torch.zeros_like(delta[0])
@@ -128,7 +128,7 @@ def advantages(batch: dict[str, Tensor], args: Args) -> Tensor:
 def update(
     agent: Agent, optimizer: torch.optim.Optimizer, batch: dict[str, Tensor], args: Args
 ) -> None:
-    """Makes the epochs of clipped policy gradients over the steps."""
+    """Make the epochs of clipped policy gradients over the steps."""
     batch["advantage"] = advantages(batch, args)
     batch["return"] = batch["advantage"] + batch["value"]
     flat = {name: leaf.flatten(0, 1) for name, leaf in batch.items()}
@@ -151,7 +151,7 @@ def update(
 
 
 def main(args: Args) -> None:
-    """Trains, and says after each iteration how it goes."""
+    """Train, and say after each iteration how it goes."""
     torch.manual_seed(args.seed)
     envs = make(args)
     agent = Agent(envs).to(envs.device)

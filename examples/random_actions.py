@@ -20,7 +20,7 @@ def main(
     episodes: int = 2,
     out: Path = Path("runs/random_actions"),
 ) -> None:
-    """Plays episodes with random joint targets and films them."""
+    """Play episodes with random joint targets and film them."""
     env = gym.make(
         task,
         obs_mode="rgb",

@@ -22,7 +22,7 @@ import ir_maniskill  # noqa: F401 - registers the tasks, for the replay as well
 
 
 def record(task: str, episodes: int, folder: Path) -> Path:
-    """Plays random actions; returns the file of what happened (beside it, a .json)."""
+    """Play random actions; return the file of what happened (beside it, a .json)."""
     env = gym.make(
         task,
         obs_mode="none",
@@ -42,7 +42,7 @@ def record(task: str, episodes: int, folder: Path) -> Path:
 
 
 def replay(recorded: Path, use_states: bool, obs_mode: str | None = None) -> Path:
-    """Plays a file again, by its actions or its states; returns the new file."""
+    """Play a file again, by its actions or its states; return the new file."""
     arguments = replay_trajectory.Args(
         str(recorded),
         obs_mode=obs_mode,
@@ -57,7 +57,7 @@ def replay(recorded: Path, use_states: bool, obs_mode: str | None = None) -> Pat
 
 
 def compare(first: h5py.Group, second: h5py.Group) -> str:
-    """Says by how much two episodes are apart at most, after each of their actions."""
+    """Say by how much two episodes are apart at most, after each of their actions."""
     reward = np.abs(first["rewards"][:] - second["rewards"][:]).max()
     actors = [episode["env_states/actors"] for episode in (first, second)]
     moved = [actors[0][name][1:, :3] - actors[1][name][1:, :3] for name in actors[0]]
@@ -71,7 +71,7 @@ def main(
     obs_mode: str | None = None,
     out: Path = Path("runs/trajectories"),
 ) -> None:
-    """Records, replays and compares."""
+    """Record, replay and compare."""
     recorded = record(task, episodes, out)
     replayed = replay(recorded, use_states, obs_mode)
     print(f"{recorded} and {replayed} differ by at most:")

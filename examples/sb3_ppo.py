@@ -23,7 +23,7 @@ import ir_maniskill  # noqa: F401 - registers the tasks
 
 
 def flatten(obs: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Returns the observation as one dict of arrays."""
+    """Return the observation as one dict of arrays."""
     felt = [*obs["agent"].values(), obs["extra"]["touch"]]
     pictures = {name: data["rgb"] for name, data in obs["sensor_data"].items()}
     words = obs["extra"]["instruction"]
@@ -31,7 +31,7 @@ def flatten(obs: dict[str, Any]) -> dict[str, np.ndarray]:
 
 
 def make(task: str, **env_kwargs: Any) -> gym.Env:
-    """Makes one env of a task as Stable-Baselines3 takes it; pictures of 72 x 36.
+    """Make one env of a task as Stable-Baselines3 takes it; pictures of 72 x 36.
 
     Its vision net takes none that are less than 36 wide.
     """
@@ -61,7 +61,7 @@ def main(
     episodes: int = 20,
     out: Path = Path("runs/sb3_ppo.zip"),
 ) -> None:
-    """Trains, saves the policy, and counts what it touches."""
+    """Train, save the policy, and count what it touches."""
     env = make(task)
     model = PPO("MultiInputPolicy", env, n_steps=rollout, gamma=0.95, seed=0, verbose=1)
     model.learn(steps)

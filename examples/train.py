@@ -34,7 +34,7 @@ STEPS = {
 def configure(
     experiment: str, preset: str, steps: int | None, out: str | None
 ) -> TrainConfig:
-    """Returns the preset's configuration for an experiment."""
+    """Return the preset's configuration for an experiment."""
     return replace(
         CONFIGS[preset],
         env_id=TASKS[experiment],
@@ -52,7 +52,7 @@ def main(
     out: str | None = None,
     resume: bool = False,
 ) -> None:
-    """Trains, and says where the best policy is."""
+    """Train, and say where the best policy is."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     best = train(configure(experiment, preset, steps, out), resume=resume)
     print(f"The best policy is in {best}.")

@@ -16,7 +16,7 @@ from ir_maniskill.environment.state import StateStack
 
 
 def main(num_envs: int = 4, steps: int = 64) -> None:
-    """Steps random actions in all envs and counts the touches."""
+    """Step random actions in all envs and count the touches."""
     envs = make_vec(
         "NaoTouchCubeTriangle-v1",
         num_envs,

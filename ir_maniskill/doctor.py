@@ -148,7 +148,7 @@ def require_vulkan() -> None:
     Cheap where there is one: it asks SAPIEN in this process.
 
     Raises:
-        RuntimeError: no device; the message holds the commands that install one.
+        RuntimeError: No device; the message holds the commands that install one.
     """
     import sapien
 

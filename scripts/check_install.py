@@ -10,7 +10,7 @@ import gymnasium as gym
 
 
 def main() -> None:
-    """Runs all checks against the environment whose folder is the first argument."""
+    """Run all checks against the environment whose folder is the first argument."""
     prefix = Path(sys.argv[1]).resolve()
     assert "ir_maniskill" not in sys.modules
     env = gym.make(
@@ -25,7 +25,7 @@ def main() -> None:
 
 
 def check_origin(prefix: Path) -> None:
-    """Modules and data files lie under the prefix, none in a checkout."""
+    """Check that modules and data files lie under the prefix, none in a checkout."""
     for name, module in sorted(sys.modules.items()):
         if name.partition(".")[0] != "ir_maniskill" or not module.__file__:
             continue
@@ -39,7 +39,7 @@ def check_origin(prefix: Path) -> None:
 
 
 def check_step(env: gym.Env) -> None:
-    """A reset and a step give images, an instruction and a reward."""
+    """Check that a reset and a step give images, an instruction and a reward."""
     observation, _ = env.reset(seed=0)
     for camera in ("top_camera", "front_camera"):
         picture = observation["sensor_data"][camera]["rgb"]

@@ -180,7 +180,7 @@ class Stage:
         return _with_arms(posture, arms)
 
     def _fingers_at(self, posture: np.ndarray) -> np.ndarray:
-        """Return where the fingers would be [F, 3] [m]; moves the robot there."""
+        """Return where the fingers would be [F, 3] [m], moving the robot there."""
         robot, drive = self._env.agent, self._env.agent.controller
         share = torch.from_numpy((posture + 1) / 2).float()
         angles = drive.lower + share * (drive.upper - drive.lower)  # [J] [rad]

@@ -39,20 +39,20 @@ ARM_LIMITS_DEG = {
 
 
 def read_facts(table: str, key: str) -> dict[str, dict[str, str]]:
-    """Returns a fact table by the values of one of its columns."""
+    """Return a fact table by the values of one of its columns."""
     with (FACTS / f"{table}.csv").open(newline="") as file:
         return {row[key]: row for row in csv.DictReader(file)}
 
 
 def rotation(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Returns Rodrigues' rotation [3, 3]."""
+    """Return Rodrigues' rotation [3, 3]."""
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
 
 
 def joint_frame(row: dict[str, str], angle: float) -> np.ndarray:
-    """Returns the frame of a joint's child in that of its parent [4, 4]."""
+    """Return the frame of a joint's child in that of its parent [4, 4]."""
     roll, pitch, yaw = (float(row[f"{name}_rad"]) for name in ("roll", "pitch", "yaw"))
     x, y, z = np.eye(3)
     turn = rotation(z, yaw) @ rotation(y, pitch) @ rotation(x, roll)
@@ -66,7 +66,7 @@ def joint_frame(row: dict[str, str], angle: float) -> np.ndarray:
 
 
 def link_frame(link: str, angles: dict[str, float]) -> np.ndarray:
-    """Returns the frame of a link in the torso's, from the fact table [4, 4]."""
+    """Return the frame of a link in the torso's, from the fact table [4, 4]."""
     parents = read_facts("joints", "child_link")
     frame = np.eye(4)
     while link != "torso":
@@ -78,7 +78,7 @@ def link_frame(link: str, angles: dict[str, float]) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def model() -> yourdfpy.URDF:
-    """Returns the URDF as an independent library reads it."""
+    """Return the URDF as an independent library reads it."""
     return yourdfpy.URDF.load(
         str(URDF_PATH), load_meshes=False, build_collision_scene_graph=False
     )
@@ -86,7 +86,7 @@ def model() -> yourdfpy.URDF:
 
 @pytest.fixture(scope="module")
 def moving_links(model: yourdfpy.URDF) -> list[str]:
-    """Returns the links that move, in the order of the joints."""
+    """Return the links that move, in the order of the joints."""
     return [model.joint_map[name].child for name in JOINTS]
 
 

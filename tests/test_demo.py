@@ -21,7 +21,7 @@ echo "$@" >> "$0.log"
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Returns an empty folder for the demonstration, beside the program."""
+    """Return an empty folder for the demonstration, beside the program."""
     program = tmp_path / "ir-maniskill"
     program.write_text(PROGRAM)
     program.chmod(0o755)
@@ -31,7 +31,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def demonstrate(folder: Path) -> list[Any]:
-    """Runs the script and returns the commands that it gave."""
+    """Run the script and return the commands that it gave."""
     program = folder.parent / "ir-maniskill"
     script = [ROOT / "scripts" / "demo.sh", program, TASK, folder, "12"]
     subprocess.run(script, cwd=folder, check=True, capture_output=True, timeout=60)

@@ -64,7 +64,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def replay(recorded: Path, **arguments: Any) -> Path:
-    """Returns the file that ManiSkill's replay of `recorded` leaves."""
+    """Return the file that ManiSkill's replay of `recorded` leaves."""
     replay_trajectory.main(
         replay_trajectory.Args(
             str(recorded),
@@ -79,7 +79,7 @@ def replay(recorded: Path, **arguments: Any) -> Path:
 
 
 def datasets(group: h5py.Group) -> dict[str, np.ndarray]:
-    """Returns all arrays of an episode by path."""
+    """Return all arrays of an episode by path."""
     found: dict[str, np.ndarray] = {}
 
     def visit(path: str, item: h5py.Dataset | h5py.Group) -> None:

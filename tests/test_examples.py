@@ -37,7 +37,7 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 
 
 def run(folder: Path, *command: str) -> str:
-    """Returns what the command prints; it must end well."""
+    """Return what the command prints; it must end well."""
     done = subprocess.run(
         [sys.executable, "-W", "ignore", *command],
         cwd=folder,
@@ -173,7 +173,7 @@ README = (ROOT / "README.md").read_text()
 
 
 def row(start: str) -> list[str]:
-    """Returns the cells of the README's table row that begins so."""
+    """Return the cells of the README's table row that begins so."""
     (line,) = (s for s in README.splitlines() if s.startswith(f"| {start} |"))
     return [cell.strip() for cell in line.strip("|").split("|")]
 
@@ -220,7 +220,7 @@ PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
 
 
 def headings(page: Path) -> set[str]:
-    """Returns the anchors of a page's headings, as GitHub names them."""
+    """Return the anchors of a page's headings, as GitHub names them."""
     titles = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
     return {re.sub(r"[^\w -]", "", t.lower()).replace(" ", "-") for t in titles}
 

@@ -43,7 +43,7 @@ CUDA = ("cuda", "nvidia", "triton")
 
 
 def pins(python: str | None = None) -> dict[str, SpecifierSet]:
-    """Returns what constraints.txt pins, for this Python or another."""
+    """Return what constraints.txt pins, for this Python or another."""
     environment = {"python_version": python} if python else None
     found: dict[str, SpecifierSet] = {}
     for line in (ROOT / "constraints.txt").read_text().splitlines():
@@ -57,7 +57,7 @@ def pins(python: str | None = None) -> dict[str, SpecifierSet]:
 
 
 def needed() -> list[tuple[str, Requirement]]:
-    """Returns all that this project's extra `dev` leads to: by whom, and what."""
+    """Return all that this project's extra `dev` leads to: by whom, and what."""
     todo, seen = [Requirement("ir-maniskill[dev]")], set()
     found: list[tuple[str, Requirement]] = []
     while todo:

@@ -82,7 +82,7 @@ _COLLISIONS: dict[str, tuple[Shape, ...]] = {
 
 
 def build(folder: Path = FOLDER) -> None:
-    """Writes the URDF and every mesh below `folder`."""
+    """Write the URDF and every mesh below `folder`."""
     (folder / "meshes").mkdir(parents=True, exist_ok=True)
     (folder / "nao.urdf").write_text(urdf(), encoding="utf-8")
     for name, content in meshes().items():
@@ -90,7 +90,7 @@ def build(folder: Path = FOLDER) -> None:
 
 
 def meshes() -> dict[str, bytes]:
-    """Returns the content of every mesh file by file name."""
+    """Return the content of every mesh file by file name."""
     frames = posture_frames()
     return {
         f"{name}.glb": bake(part.surface, PALETTE, part.light).export(
@@ -101,14 +101,14 @@ def meshes() -> dict[str, bytes]:
 
 
 def posture_frames() -> Frames:
-    """Returns the frame of every link in the torso's, in the resting posture."""
+    """Return the frame of every link in the torso's, in the resting posture."""
     return facts.forward_kinematics(
         facts.read_joints(), facts.read_posture(), root=ROOT
     )
 
 
 def urdf() -> str:
-    """Returns the text of the URDF."""
+    """Return the text of the URDF."""
     joints, driven = facts.read_joints(), facts.read_actuation()
     inertials = link_inertials(joints, driven)
     robot = ET.Element("robot", name="nao")
@@ -124,7 +124,7 @@ def urdf() -> str:
 def link_inertials(
     joints: Mapping[str, Row], driven: Mapping[str, Actuation]
 ) -> dict[str, Inertial]:
-    """Returns the mass properties of the model's links, root first."""
+    """Return the mass properties of the model's links, root first."""
     table = facts.read_inertials()
     moving = [joints[name]["child_link"] for name in driven]
     inertials = {ROOT: merged_inertial(table, moving)}
@@ -134,7 +134,7 @@ def link_inertials(
 
 
 def merged_inertial(table: Mapping[str, Inertial], moving: list[str]) -> Inertial:
-    """Returns all that never moves, sensor frames aside, as one body of the torso."""
+    """Return all that never moves, sensor frames aside, as one body of the torso."""
     frames = posture_frames()
     return facts.lump(
         body.moved(frames[link])
@@ -144,7 +144,7 @@ def merged_inertial(table: Mapping[str, Inertial], moving: list[str]) -> Inertia
 
 
 def phalanx_inertial() -> Inertial:
-    """Returns the mass properties of a finger link."""
+    """Return the mass properties of a finger link."""
     solid = facts.capsule_inertial(
         PHALANX_MASS, PHALANX_RADIUS, PHALANX_SHAFT, PHALANX_PITCH / 2
     )

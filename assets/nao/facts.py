@@ -33,7 +33,7 @@ class Inertial:
     """Inertia about the center of mass, axes of the link [kg m^2], shape [3, 3]."""
 
     def moved(self, frame: np.ndarray) -> "Inertial":
-        """Returns the same body seen from the frame that `frame` leads to."""
+        """Return the same body seen from the frame that `frame` leads to."""
         rotation = frame[:3, :3]
         com = rotation @ self.com + frame[:3, 3]
         return Inertial(self.mass, com, rotation @ self.inertia @ rotation.T)
@@ -54,23 +54,23 @@ class Actuation:
 
 
 def read(table: str) -> list[Row]:
-    """Returns the rows of `facts/<table>.csv`."""
+    """Return the rows of `facts/<table>.csv`."""
     with (FOLDER / f"{table}.csv").open(newline="") as file:
         return list(csv.DictReader(file))
 
 
 def read_joints() -> dict[str, Row]:
-    """Returns the joint table by joint name, its figures still as written."""
+    """Return the joint table by joint name, its figures still as written."""
     return {row["joint"]: row for row in read("joints")}
 
 
 def read_inertials() -> dict[str, Inertial]:
-    """Returns the mass properties by link name."""
+    """Return the mass properties by link name."""
     return {row["link"]: _inertial(row) for row in read("links")}
 
 
 def read_actuation() -> dict[str, Actuation]:
-    """Returns the driven joints in the order of the robot's action."""
+    """Return the driven joints in the order of the robot's action."""
     return {
         row["joint"]: Actuation(
             float(row["lower_deg"]),
@@ -83,14 +83,14 @@ def read_actuation() -> dict[str, Actuation]:
 
 
 def read_posture() -> dict[str, float]:
-    """Returns the angles of the joints that never move; those not named are 0."""
+    """Return the angles of the joints that never move; those not named are 0."""
     return {row["joint"]: float(row["angle_rad"]) for row in read("posture")}
 
 
 def forward_kinematics(
     joints: Mapping[str, Row], angles: Mapping[str, float], root: str = "torso"
 ) -> Frames:
-    """Returns the frame of every link below `root`, in the frame of `root`."""
+    """Return the frame of every link below `root`, in the frame of `root`."""
     frames = {root: np.eye(4)}
     pending = [row for row in joints.values() if row["child_link"] != root]
     while ready := [row for row in pending if row["parent_link"] in frames]:
@@ -102,7 +102,7 @@ def forward_kinematics(
 
 
 def lump(bodies: Iterable[Inertial]) -> Inertial:
-    """Returns the one rigid body that `bodies`, all in one frame, make together."""
+    """Return the one rigid body that `bodies`, all in one frame, make together."""
     bodies = list(bodies)
     mass = sum(body.mass for body in bodies)
     com = sum((body.mass * body.com for body in bodies), np.zeros(3)) / mass
@@ -114,7 +114,7 @@ def lump(bodies: Iterable[Inertial]) -> Inertial:
 
 
 def capsule_inertial(mass: float, radius: float, shaft: float, x: float) -> Inertial:
-    """Returns a solid capsule lying along x, its center at (x, 0, 0)."""
+    """Return a solid capsule lying along x, its center at (x, 0, 0)."""
     density = mass / (np.pi * radius**2 * (shaft + 4 / 3 * radius))
     rod, ball = (
         density * np.pi * radius**2 * shaft,

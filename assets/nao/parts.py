@@ -40,7 +40,7 @@ _FINGER_LIGHT = (0.0, 1.0, 0.0)  # the back of a finger, see the folder's README
 
 
 def parts(frames: Frames) -> dict[str, Part]:
-    """Returns every mesh by file name.
+    """Return every mesh by file name.
 
     Args:
         frames: Frame of every link in the torso's, in the posture to be merged.
@@ -56,7 +56,7 @@ def parts(frames: Frames) -> dict[str, Part]:
 
 
 def body(frames: Frames) -> Surface:
-    """Returns all that never moves, and the shoulders, in the torso's frame."""
+    """Return all that never moves, and the shoulders, in the torso's frame."""
     shoulder = drum().shifted(0, 0.098, 0.1)
     pieces = [torso(), head().moved(frames["Head"]), shoulder, shoulder.mirrored()]
     for link, surface in (("Thigh", thigh()), ("Tibia", shin()), ("_ankle", foot())):
@@ -67,7 +67,7 @@ def body(frames: Frames) -> Surface:
 
 
 def torso() -> Surface:
-    """Returns the trunk with neck, chest button and sonars."""
+    """Return the trunk with neck, chest button and sonars."""
     button = knob([GREY, GLOW], [(0, 0.0165), (0.006, 0.0105)], segments=8)
     sonar = _spot(DARK, 0.0085, segments=6).turned(0, 0.06, 0.3)
     sonar = sonar.shifted(0.0525, 0.023, 0.018)
@@ -106,12 +106,12 @@ def _trunk() -> Surface:
 
 
 def _behind(middles: np.ndarray) -> np.ndarray:
-    """Returns which cells face the back of what is round about the z axis."""
+    """Return which cells face the back of what is round about the z axis."""
     return (middles[0] < 0) & (abs(middles[1]) < 1.2 * abs(middles[0]))
 
 
 def head() -> Surface:
-    """Returns the round head with eyes, ears, cameras and touch sensors."""
+    """Return the round head with eyes, ears, cameras and touch sensors."""
     camera = _spot(BLACK, 0.0062, segments=6)
     return join(
         [
@@ -165,7 +165,7 @@ def _ear() -> Surface:
 
 
 def _crown() -> Surface:
-    """Returns the three touch sensors on top of the head, front to back."""
+    """Return the three touch sensors on top of the head, front to back."""
     return loft(
         "x",
         [GREY, DARK, GREY],
@@ -181,7 +181,7 @@ def _crown() -> Surface:
 
 
 def thigh() -> Surface:
-    """Returns the left thigh, which ends in the knee."""
+    """Return the left thigh, which ends in the knee."""
     shell = loft(
         "z",
         [GREY, WHITE, WHITE],
@@ -198,7 +198,7 @@ def thigh() -> Surface:
 
 
 def shin() -> Surface:
-    """Returns the left shin."""
+    """Return the left shin."""
     return loft(
         "z",
         [GREY, WHITE, WHITE],
@@ -214,7 +214,7 @@ def shin() -> Surface:
 
 
 def foot() -> Surface:
-    """Returns the left foot, sole at z = -0.04511."""
+    """Return the left foot, sole at z = -0.04511."""
     return loft(
         "z",
         [DARK, WHITE],
@@ -229,7 +229,7 @@ def foot() -> Surface:
 
 
 def drum() -> Surface:
-    """Returns the left shoulder's drum, round about the axis it turns on."""
+    """Return the left shoulder's drum, round about the axis it turns on."""
     return loft(
         "y",
         [GREY, DARK],
@@ -244,7 +244,7 @@ def drum() -> Surface:
 
 
 def bicep() -> Surface:
-    """Returns the left upper arm, from the shoulder's cap to the elbow's ball."""
+    """Return the left upper arm, from the shoulder's cap to the elbow's ball."""
     shell = loft(
         "x",
         WHITE,
@@ -263,7 +263,7 @@ def bicep() -> Surface:
 
 
 def elbow() -> Surface:
-    """Returns the left elbow: a sleeve and a ball, round about the axis of the yaw."""
+    """Return the left elbow: a sleeve and a ball, round about the axis of the yaw."""
     return loft(
         "x",
         [SHELL, GREY, GREY],
@@ -279,7 +279,7 @@ def elbow() -> Surface:
 
 
 def hand() -> Surface:
-    """Returns the left hand: forearm, wrist, palm and the seats of the fingers."""
+    """Return the left hand: forearm, wrist, palm and the seats of the fingers."""
     palm = loft(
         "x",
         [GREY, WHITE, WHITE],
@@ -298,7 +298,7 @@ def hand() -> Surface:
 
 
 def forearm() -> Surface:
-    """Returns the left forearm, round about the axis of the wrist."""
+    """Return the left forearm, round about the axis of the wrist."""
     return loft(
         "x",
         [WHITE, WHITE, ORANGE],
@@ -315,7 +315,7 @@ def forearm() -> Surface:
 
 
 def phalanx() -> Surface:
-    """Returns an inner phalanx, along x."""
+    """Return an inner phalanx, along x."""
     return loft(
         "x",
         SHELL,
@@ -331,7 +331,7 @@ def phalanx() -> Surface:
 
 
 def fingertip() -> Surface:
-    """Returns the last phalanx; its open foot hides in the one before."""
+    """Return the last phalanx; its open foot hides in the one before."""
     return loft(
         "x",
         [SHELL, DARK, DARK],
@@ -347,5 +347,5 @@ def fingertip() -> Surface:
 
 
 def _spot(color: int, radius: float, segments: int) -> Surface:
-    """Returns a flat disc at the origin that looks along +x."""
+    """Return a flat disc at the origin that looks along +x."""
     return knob([color], [(0, radius)], segments)

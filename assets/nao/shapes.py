@@ -53,27 +53,27 @@ class Surface:
     """Which flat cell, a quadrilateral or a lid, the face is a part of, shape [F]."""
 
     def moved(self, frame: np.ndarray) -> "Surface":
-        """Returns the surface carried by the homogeneous transform `frame`."""
+        """Return the surface carried by the homogeneous transform `frame`."""
         vertices = self.vertices @ frame[:3, :3].T + frame[:3, 3]
         return replace(self, vertices=vertices)
 
     def shifted(self, x: float, y: float, z: float) -> "Surface":
-        """Returns the surface moved by (x, y, z) [m]."""
+        """Return the surface moved by (x, y, z) [m]."""
         return replace(self, vertices=self.vertices + np.array([x, y, z]))
 
     def turned(self, roll: float, pitch: float, yaw: float) -> "Surface":
-        """Returns the surface turned about the fixed axes x, y, z in turn [rad]."""
+        """Return the surface turned about the fixed axes x, y, z in turn [rad]."""
         return self.moved(euler_matrix(roll, pitch, yaw, axes="sxyz"))
 
     def mirrored(self) -> "Surface":
-        """Returns the mirror image left for right."""
+        """Return the mirror image left for right."""
         vertices = self.vertices * np.array([1, -1, 1])
         return replace(self, vertices=vertices, faces=self.faces[:, ::-1])
 
     def painted(
         self, color: int, where: Callable[[np.ndarray], np.ndarray]
     ) -> "Surface":
-        """Returns the surface with other cells colored.
+        """Return the surface with other cells colored.
 
         Args:
             color: The new color.
@@ -87,7 +87,7 @@ class Surface:
 
 
 def join(surfaces: Sequence[Surface]) -> Surface:
-    """Returns the surfaces as one, their smoothing groups kept apart."""
+    """Return the surfaces as one, their smoothing groups kept apart."""
     corners = [len(part.vertices) for part in surfaces]
     groups = [part.groups.max() + 1 for part in surfaces]
     cells = [part.cells.max() + 1 for part in surfaces]
@@ -108,7 +108,7 @@ def loft(
     caps: str = "both",
     lid: int | None = None,
 ) -> Surface:
-    """Returns the skin over a row of cross sections.
+    """Return the skin over a row of cross sections.
 
     Args:
         axis: The axis the sections are strung on, "x", "y" or "z"; u and v are the
@@ -139,7 +139,7 @@ def loft(
 def knob(
     colors: Sequence[int], profile: Sequence[tuple[float, float]], segments: int
 ) -> Surface:
-    """Returns a round knob standing on the origin along +x.
+    """Return a round knob standing on the origin along +x.
 
     Args:
         colors: One per span of the profile, and one for the lid.
@@ -151,7 +151,7 @@ def knob(
 
 
 def palette(colors: Sequence[tuple[int, int, int]]) -> Image.Image:
-    """Returns the palette: a column per color, the brightest row on top."""
+    """Return the palette: a column per color, the brightest row on top."""
     brightness = np.linspace(1.0, _DARKEST, _LEVELS)[:, None, None]  # [L, 1, 1]
     row = np.repeat(np.array(colors, float), _SWATCH_WIDTH, axis=0)  # [W, 3]
     return Image.fromarray(np.rint(row * brightness).astype(np.uint8), "RGB")
@@ -160,7 +160,7 @@ def palette(colors: Sequence[tuple[int, int, int]]) -> Image.Image:
 def bake(
     surface: Surface, colors: Sequence[tuple[int, int, int]], light: Sequence[float]
 ) -> trimesh.Trimesh:
-    """Returns the surface as a mesh with normals and one textured material.
+    """Return the surface as a mesh with normals and one textured material.
 
     Args:
         surface: What to bake.
@@ -191,7 +191,7 @@ def bake(
 
 
 def _renumbered(indices: Sequence[np.ndarray], counts: Sequence[int]) -> np.ndarray:
-    """Returns the index arrays as one, each shifted past those before it."""
+    """Return the index arrays as one, each shifted past those before it."""
     shifts = np.cumsum([0, *counts[:-1]])
     return np.concatenate([i + n for i, n in zip(indices, shifts, strict=True)])
 
@@ -199,7 +199,7 @@ def _renumbered(indices: Sequence[np.ndarray], counts: Sequence[int]) -> np.ndar
 def _texture_coordinates(
     color: np.ndarray, normals: np.ndarray, colors: int, light: Sequence[float]
 ) -> np.ndarray:
-    """Returns where in the palette each vertex looks, shape [V, 2]."""
+    """Return where in the palette each vertex looks, shape [V, 2]."""
     toward = np.asarray(light, float) / np.linalg.norm(light)
     shade = (1 + normals @ toward) / 2  # [V] in [0, 1]
     return np.stack(
@@ -208,7 +208,7 @@ def _texture_coordinates(
 
 
 def _smooth_normals(surface: Surface) -> np.ndarray:
-    """Returns area-weighted normals by vertex and group, shape [V, groups, 3]."""
+    """Return area-weighted normals by vertex and group, shape [V, groups, 3]."""
     a, b, c = np.moveaxis(surface.vertices[surface.faces], 1, 0)
     areas = np.cross(b - a, c - a)  # [F, 3]
     normals = np.zeros((len(surface.vertices), surface.groups.max() + 1, 3))
@@ -233,7 +233,7 @@ class _Builder:
         self._cell = 0
 
     def add_ring(self, section: Section) -> None:
-        """Adds the points of a section, or the one point of a closed end."""
+        """Add the points of a section, or the one point of a closed end."""
         first = len(self._vertices)
         if not any(section.half):
             self._vertices.append(np.array([section.at, *section.center]))
@@ -247,7 +247,7 @@ class _Builder:
         self._rings.append(first + np.arange(self._segments))
 
     def add_span(self, span: int, color: int) -> None:
-        """Adds the skin between section `span` and the next."""
+        """Add the skin between section `span` and the next."""
         low, high = self._rings[span : span + 2]
         for i in range(self._segments):
             j = (i + 1) % self._segments
@@ -256,7 +256,7 @@ class _Builder:
             self._cell += 1
 
     def add_lid(self, ring: int, color: int, up: bool) -> None:
-        """Adds a flat lid that looks up or down the axis, with a hard edge."""
+        """Add a flat lid that looks up or down the axis, with a hard edge."""
         self._group += 1
         points = self._rings[ring]
         points = points if up else points[::-1]
@@ -265,7 +265,7 @@ class _Builder:
         self._cell += 1
 
     def surface(self, axis: int) -> Surface:
-        """Returns the surface with w along the given axis."""
+        """Return the surface with w along the given axis."""
         return Surface(
             np.roll(np.array(self._vertices), axis, axis=1),
             np.array(self._faces),

@@ -47,7 +47,7 @@ class Actor(nn.Module):
             self.register_buffer("log_std", log_std)
 
     def forward(self, aligned: Tensor) -> Normal:
-        """Return the distribution of a_t [N,A] given B_t [N,D]."""
+        """Return the distribution of a_t [N, A] given B_t [N, D]."""
         mean = self.mean(aligned)
         std = self.log_std.exp().expand_as(mean)
         return Normal(mean, std, validate_args=False)

@@ -66,7 +66,7 @@ class StateSpec:
 class Act(NamedTuple):
     """What the agent does in a state, and what it thinks of it."""
 
-    action: Tensor  # [N,A], not yet clipped to [-1,1]
+    action: Tensor  # [N, A], not yet clipped to [-1, 1]
     log_prob: Tensor  # [N]
     value: Tensor  # [N]
 
@@ -77,7 +77,7 @@ class Judgement(NamedTuple):
     log_prob: Tensor  # [N]
     entropy: Tensor  # [N]
     value: Tensor  # [N]
-    named_position: Tensor | None  # [N,3] [m], where the named object is thought to be
+    named_position: Tensor | None  # [N, 3] [m], where the named object is thought to be
 
 
 class StateEncoder(nn.Module):
@@ -114,7 +114,7 @@ class StateEncoder(nn.Module):
         self.alignment = Alignment()
 
     def forward(self, state: State) -> Tensor:
-        """Return B_t [N,D] = [G_t, V_t, H_t]."""
+        """Return B_t [N, D] = [G_t, V_t, H_t]."""
         embeddings = [self.language(state["instruction"])]
         if self.vision is not None:
             embeddings.append(self.vision(state["images"], embeddings[0]))
@@ -163,9 +163,9 @@ class Agent(nn.Module):
         """Make an untrained agent.
 
         Args:
-            config: its parts; `senses` must be given.
-            spec: shapes of what it reads and does.
-            policy_only: leave out what only training needs (critic, auxiliary head).
+            config: Its parts; `senses` must be given.
+            spec: Shapes of what it reads and does.
+            policy_only: Leave out what only training needs (critic, auxiliary head).
         """
         super().__init__()
         if config.senses is None:
@@ -212,7 +212,7 @@ class Agent(nn.Module):
 
     @torch.no_grad()
     def policy(self, state: State) -> Tensor:
-        """Return the policy's mean action [N,A] in [-1,1], without any noise."""
+        """Return the policy's mean action [N, A] in [-1, 1], without any noise."""
         needed = ["tokens", "frames", "joints", "fingers"]
         if self.encoder.vision is not None:
             needed += ["cameras", "height", "width"]
@@ -229,7 +229,7 @@ class Agent(nn.Module):
         return self._value(state, aligned)
 
     def evaluate_actions(self, state: State, action: Tensor) -> Judgement:
-        """Return how likely the actions [N,A] are now, and the states' values."""
+        """Return how likely the actions [N, A] are now, and the states' values."""
         aligned = self.encoder(state)
         policy = self.actor(aligned)
         return Judgement(
@@ -240,7 +240,7 @@ class Agent(nn.Module):
         )
 
     def observe(self, privileged: Tensor) -> None:
-        """Let the scales of the simulator's state follow what was seen [N,P]."""
+        """Let the scales of the simulator's state follow what was seen [N, P]."""
         for encoder in (self.encoder, self.critic_encoder):
             if encoder is not None and encoder.standardize is not None:
                 encoder.standardize.update(privileged)

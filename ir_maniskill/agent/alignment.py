@@ -8,7 +8,7 @@ class Alignment(nn.Module):
     """B_t = [G_t, V_t, H_t]: the embeddings of all senses side by side."""
 
     def forward(self, *embeddings: Tensor) -> Tensor:
-        """Return the embeddings [N,D_i] concatenated to [N,sum D_i]."""
+        """Return the embeddings [N, D_i] concatenated to [N, sum D_i]."""
         return torch.cat(embeddings, dim=1)
 
 
@@ -27,6 +27,6 @@ class FiLM(nn.Module):
         nn.init.zeros_(self.scale_and_shift.bias)
 
     def forward(self, maps: Tensor, language: Tensor) -> Tensor:
-        """Return the maps [N,C,H,W] modulated by G_t [N,D]."""
+        """Return the maps [N, C, H, W] modulated by G_t [N, D]."""
         scale, shift = self.scale_and_shift(language)[..., None, None].chunk(2, dim=1)
         return torch.addcmul(maps + shift, maps, scale)

@@ -17,7 +17,7 @@ class Critic(nn.Module):
         self.value = tanh_layers(inputs, hidden, 1, gain=1.0)
 
     def forward(self, aligned: Tensor) -> Tensor:
-        """Return the value [N] given B_t [N,D]."""
+        """Return the value [N] given B_t [N, D]."""
         return self.value(aligned).squeeze(-1)
 
 
@@ -36,13 +36,13 @@ class Standardize(nn.Module):
         self.register_buffer("count", torch.zeros(()))
 
     def forward(self, values: Tensor) -> Tensor:
-        """Return the values [N,P] standardized, cut at 10 deviations."""
+        """Return the values [N, P] standardized, cut at 10 deviations."""
         deviation = self.variance.sqrt().clamp_min(1e-4)
         return ((values - self.mean) / deviation).clamp(-10, 10)
 
     @torch.no_grad()
     def update(self, values: Tensor) -> None:
-        """Take values [N,P] into account (Chan's parallel mean and variance)."""
+        """Take values [N, P] into account (Chan's parallel mean and variance)."""
         count = len(values)
         total = self.count + count
         variance, mean = torch.var_mean(values, dim=0, correction=0)

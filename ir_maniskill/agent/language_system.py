@@ -23,13 +23,13 @@ class EncoderLayer(nn.Module):
         self.feed_forward_norm = nn.LayerNorm(width)
 
     def forward(self, tokens: Tensor, attend: Tensor) -> Tensor:
-        """Return the tokens [N,L,D], each informed by those it may attend to.
+        """Return the tokens [N, L, D], each informed by those it may attend to.
 
         Softmax(W_Q Q (W_K K)^T / sqrt(d)) W_V V, with Q = K = V = the tokens.
         """
-        projected = self.queries_keys_values(tokens)  # [N,L,3D]
+        projected = self.queries_keys_values(tokens)  # [N, L, 3D]
         split = projected.unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        queries, keys, values = split  # [N,heads,L,D/heads] each
+        queries, keys, values = split  # [N, heads, L, D/heads] each
         heads = functional.scaled_dot_product_attention(
             queries, keys, values, attn_mask=attend[:, None, None, :]
         )
@@ -54,7 +54,7 @@ class LanguageSystem(nn.Module):
         self.layers = nn.ModuleList(EncoderLayer(width, heads) for _ in range(layers))
 
     def forward(self, instruction: Tensor) -> Tensor:
-        """Return G_t [N,L*D] of the token ids [N,L].
+        """Return G_t [N, L*D] of the token ids [N, L].
 
         A batch repeats few sentences many times, so each is encoded only once.
         """
@@ -62,8 +62,8 @@ class LanguageSystem(nn.Module):
         return self._encode(sentences).index_select(0, which)
 
     def _encode(self, sentences: Tensor) -> Tensor:
-        present = sentences != PAD  # [M,L]
-        tokens = self.words(sentences) + self.positions  # [M,L,D]
+        present = sentences != PAD  # [M, L]
+        tokens = self.words(sentences) + self.positions  # [M, L, D]
         for layer in self.layers:
             tokens = layer(tokens, present)
-        return (tokens * present[..., None]).flatten(1)  # [M,L*D]
+        return (tokens * present[..., None]).flatten(1)  # [M, L*D]

@@ -11,7 +11,10 @@ from ir_maniskill.agent.alignment import FiLM
 
 
 def pixels(images: Tensor) -> Tensor:
-    """Return uint8 images [N,H,W,C] as floats [N,C,H,W] in [-1,1], channels last."""
+    """Return uint8 images [N, H, W, C] as floats [N, C, H, W] in [-1, 1].
+
+    In memory the channels stay last.
+    """
     return images.permute(0, 3, 1, 2).float().mul_(2 / 255).sub_(1)
 
 
@@ -36,10 +39,10 @@ class PaperVision(nn.Module):
         )
 
     def forward(self, images: Tensor, language: Tensor) -> Tensor:
-        """Return V_t [N,D] of images [N,S,K,H,W,3]; the sentence plays no part."""
+        """Return V_t [N, D] of images [N, S, K, H, W, 3]; the sentence has no part."""
         del language
         wide = [torch.cat(frame.unbind(1), dim=2) for frame in images.unbind(1)]
-        joined = pixels(torch.cat(wide, dim=-1))  # [N,3S,H,K*W]
+        joined = pixels(torch.cat(wide, dim=-1))  # [N, 3S, H, K*W]
         size = (self.height, self.width * images.shape[2])
         if joined.shape[-2:] != size:
             joined = functional.interpolate(joined, size, mode="area")
@@ -86,8 +89,8 @@ class CameraVision(nn.Module):
         return sides[0] * sides[1]
 
     def forward(self, images: Tensor, language: Tensor) -> Tensor:
-        """Return the flat maps [N,D] of this camera's images [N,S,H,W,3]."""
-        maps = pixels(torch.cat(images.unbind(1), dim=-1))  # [N,3S,H,W]
+        """Return the flat maps [N, D] of this camera's images [N, S, H, W, 3]."""
+        maps = pixels(torch.cat(images.unbind(1), dim=-1))  # [N, 3S, H, W]
         layers = zip(self.convolutions, self.norms, self.films, strict=True)
         for convolve, normalize, film in layers:
             maps = convolve(maps)
@@ -125,7 +128,7 @@ class PatchVision(nn.Module):
         )
 
     def forward(self, images: Tensor, language: Tensor) -> Tensor:
-        """Return V_t [N,D] of images [N,S,K,H,W,3], looked at as G_t [N,D'] asks."""
+        """Return V_t [N, D] of images [N, S, K, H, W, 3], seen as G_t [N, D'] asks."""
         maps = [
             camera(images[:, :, k], language) for k, camera in enumerate(self.cameras)
         ]
@@ -148,5 +151,5 @@ class BodySense(nn.Module):
         self.embedding = nn.Sequential(nn.Linear(inputs, features), norm, nn.Tanh())
 
     def forward(self, *senses: Tensor) -> Tensor:
-        """Return H_t [N,D] of senses [N,...], flattened side by side."""
+        """Return H_t [N, D] of senses [N, ...], flattened side by side."""
         return self.embedding(torch.cat([sense.flatten(1) for sense in senses], dim=1))

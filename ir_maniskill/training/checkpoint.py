@@ -64,8 +64,8 @@ def write(path: Path, stored: Stored) -> None:
     """Write the file so that a crash leaves either the old one or the new one.
 
     Raises:
-        CheckpointError: if it cannot be written; the file there before is untouched.
-        TrainingDivergedError: if a number in it is not finite; likewise.
+        CheckpointError: If it cannot be written; the file there before is untouched.
+        TrainingDivergedError: If a number in it is not finite; likewise.
     """
     tensors = {k: v.detach().cpu().contiguous() for k, v in stored.tensors.items()}
     check_finite(tensors, "checkpoint", "the learning rate is too high")
@@ -78,7 +78,7 @@ def replace(path: Path, data: bytes) -> None:
     """Put `data` in place of the file, or leave the file as it is if that fails.
 
     Raises:
-        CheckpointError: if it cannot be written; the file there before is untouched.
+        CheckpointError: If it cannot be written; the file there before is untouched.
     """
     aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -110,7 +110,7 @@ def read(path: Path) -> Stored:
     """Return the contents of a checkpoint or policy file.
 
     Raises:
-        CheckpointError: if the file is missing, foreign, cut short or altered.
+        CheckpointError: If the file is missing, foreign, cut short or altered.
     """
     path = Path(path)
     if path.exists() and not path.is_file():  # reading a pipe might never end
@@ -198,12 +198,12 @@ def save_policy(
     """Write the weights that act, with where they come from and how good they are.
 
     Args:
-        path: file to write.
-        agent: the learner.
-        config: how it was trained.
-        steps: environment steps it was trained for.
-        evaluation: figures of its evaluation, plain data.
-        half: store 16 instead of 32 bits a weight.
+        path: File to write.
+        agent: The learner.
+        config: How it was trained.
+        steps: Environment steps it was trained for.
+        evaluation: Figures of its evaluation, plain data.
+        half: Store 16 instead of 32 bits a weight.
     """
     weights = {
         name: weight.half() if half and weight.is_floating_point() else weight
@@ -220,7 +220,7 @@ def load_policy(path: Path | str) -> tuple[Agent, TrainConfig, dict[str, Any]]:
     The agent of a policy file has no critic: use `agent.policy`.
 
     Raises:
-        CheckpointError: if the file is none of ours, or does not fit its own config.
+        CheckpointError: If the file is none of ours, or does not fit its own config.
     """
     stored = read(Path(path))
     try:

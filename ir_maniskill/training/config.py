@@ -332,7 +332,7 @@ def decode(cls: type[Config], data: object) -> Config:
     """Return the dataclass `cls` from plain JSON data, strictly but for `LATER`.
 
     Raises:
-        ConfigError: if a field is unknown, missing, of another type than declared, or
+        ConfigError: If a field is unknown, missing, of another type than declared, or
             out of its range.
     """
     _require(isinstance(data, dict), cls.__name__, data, "an object of its fields")

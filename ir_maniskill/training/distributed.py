@@ -36,7 +36,7 @@ def group(timeout: timedelta = TIMEOUT) -> Iterator[None]:
     Does nothing in a process on its own, or in one that has joined already.
 
     Raises:
-        RankError: if the others do not come.
+        RankError: If the others do not come.
     """
     if dist.is_initialized() or int(os.environ.get("WORLD_SIZE", "1")) == 1:
         yield
@@ -77,7 +77,7 @@ def cores() -> int:
 
 
 def gather(values: Tensor) -> Tensor:
-    """Return the rows [B,...] of all ranks as one tensor [R*B,...]."""
+    """Return the rows [B, ...] of all ranks as one tensor [R*B, ...]."""
     if size() == 1:
         return values
     values = values.contiguous()

@@ -192,7 +192,7 @@ class _Record:
     episodes: int
     success: Tensor = field(init=False)  # [E]
     exclusive: Tensor = field(init=False)  # [E]
-    sums: Tensor = field(init=False)  # [E,5]: see SUMS
+    sums: Tensor = field(init=False)  # [E, 5]: see SUMS
 
     SUMS = ("steps", "touching", "right_fingers", "wrong_fingers", "return")
 

@@ -14,12 +14,12 @@ def check_finite(tensors: Mapping[str, Tensor], group: str, cause: str) -> None:
     """Raise unless all tensors are finite.
 
     Args:
-        tensors: by name; those of whole numbers are always finite.
-        group: what they are, for the message ("gradient", "weight", ...).
-        cause: the likely reason, and what to do.
+        tensors: By name; those of whole numbers are always finite.
+        group: What they are, for the message ("gradient", "weight", ...).
+        cause: The likely reason, and what to do.
 
     Raises:
-        TrainingDivergedError: naming the tensors that are not finite.
+        TrainingDivergedError: Naming the tensors that are not finite.
     """
     floats = {k: v for k, v in tensors.items() if v.is_floating_point()}
     # A sum is finite only if its terms are: one cheap pass before looking closer.

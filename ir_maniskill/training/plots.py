@@ -34,7 +34,7 @@ class PlotError(ValueError):
 
 
 def learning_curve(run: Path, out: Path | None = None) -> Path:
-    """Draws success, touch and return over the steps of a run.
+    """Draw success, touch and return over the steps of a run.
 
     Lines are the exploring policy, dots its evaluations without noise; "it" is the
     object that the sentence names.
@@ -95,7 +95,7 @@ class Curve:
 
 
 def compare(curves: Sequence[Curve], out: Path, level: float | None = None) -> Path:
-    """Draws ways of learning side by side.
+    """Draw ways of learning side by side.
 
     Each has a line for the mean of its seeds and a band for their range, as far as all
     of them reach, and a thin line for every seed.
@@ -160,7 +160,7 @@ def _draw_range(
 
 
 def _read(table: Path) -> list[dict[str, float]]:
-    """Reads a table of numbers; [] if it is missing."""
+    """Read a table of numbers; [] if it is missing."""
     try:
         return [{k: float(v) for k, v in row.items()} for row in whole_rows(table)]
     except FileNotFoundError:

@@ -20,9 +20,9 @@ class Batch:
     """Steps drawn from the roll-outs, B of them."""
 
     state: State
-    """s_t, each entry [B,...]."""
+    """s_t, each entry [B, ...]."""
     action: Tensor
-    """a_t as sampled, not clipped [B,A]."""
+    """a_t as sampled, not clipped [B, A]."""
     log_prob: Tensor
     """log pi(a_t|s_t) when it was sampled [B]."""
     advantage: Tensor
@@ -39,7 +39,7 @@ class Frames:
     """
 
     def __init__(self, steps: int, images: Tensor) -> None:
-        """Make room for `steps` stacks like these images [N,S,K,H,W,3]."""
+        """Make room for `steps` stacks like these images [N, S, K, H, W, 3]."""
         num_envs, self.depth, *image = images.shape
         rows = steps + self.depth - 1
         self.images = images.new_zeros(rows, num_envs, *image)
@@ -58,12 +58,12 @@ class Frames:
         self.births[fresh] = newest
         rows = newest - torch.arange(self.depth, device=self.rows.device)
         # A state never looks back beyond the first observation of its episode.
-        self.rows[t] = torch.maximum(rows, self.births[:, None])  # [N,S]
+        self.rows[t] = torch.maximum(rows, self.births[:, None])  # [N, S]
 
     def batch(self, index: Tensor) -> Tensor:
-        """Return the stacks [B,S,K,H,W,3] of the flat indices t * N + n [B]."""
+        """Return the stacks [B, S, K, H, W, 3] of the flat indices t * N + n [B]."""
         num_envs = len(self.births)
-        rows = self.rows.flatten(0, 1)[index]  # [B,S]
+        rows = self.rows.flatten(0, 1)[index]  # [B, S]
         rows = rows * num_envs + (index % num_envs)[:, None]
         images = self.images.flatten(0, 1).index_select(0, rows.flatten())
         return images.unflatten(0, rows.shape)
@@ -105,10 +105,10 @@ class Rollout:
         """Keep what step t led to.
 
         Args:
-            t: the step.
+            t: The step.
             reward: r_t [N].
-            done: whether the episode ended with this step [N].
-            cut: value of what an ended episode would still have brought [N].
+            done: Whether the episode ended with this step [N].
+            cut: Value of what an ended episode would still have brought [N].
         """
         self.reward[t], self.done[t], self.next_value[t] = reward, done, cut
 
@@ -116,9 +116,9 @@ class Rollout:
         """Turn rewards and values into advantages and returns.
 
         Args:
-            last_value: value of the states after the last step [N].
-            gamma: discount.
-            gae_lambda: decay of the advantage estimate.
+            last_value: Value of the states after the last step [N].
+            gamma: Discount.
+            gae_lambda: Decay of the advantage estimate.
         """
         following = torch.cat([self.value[1:], last_value[None]])
         self.next_value = torch.where(self.done, self.next_value, following)
@@ -144,7 +144,7 @@ def advantages(
     gamma: float,
     gae_lambda: float,
 ) -> Tensor:
-    """Return the generalized advantage estimate of every step, all [T,N].
+    """Return the generalized advantage estimate of every step, all [T, N].
 
     A_t = d_t + gamma lambda A_{t+1}, with d_t = r_t + gamma V(s_{t+1}) - V(s_t); where
     an episode is done the sum ends. With lambda = 1 these are Monte-Carlo returns less
@@ -171,7 +171,7 @@ class RewardScale:
         self.count, self.mean, self.variance = 0, 0.0, 1.0
 
     def __call__(self, reward: Tensor, done: Tensor) -> Tensor:
-        """Return the rewards [T,N] scaled, after taking them into account."""
+        """Return the rewards [T, N] scaled, after taking them into account."""
         running = self.running.to(reward.device)
         returns = torch.empty_like(reward)
         for t in range(len(reward)):

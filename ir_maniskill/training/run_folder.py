@@ -34,7 +34,7 @@ class RunFolder:
         """Make or enter the folder.
 
         Raises:
-            CheckpointError: if it holds a run that would be overwritten, cannot be
+            CheckpointError: If it holds a run that would be overwritten, cannot be
                 written to, or its disk is nearly full.
         """
         self.path = path
@@ -75,7 +75,7 @@ class RunFolder:
             The steps of the last evaluation recorded; 0 if there is none.
 
         Raises:
-            CheckpointError: if another training is using the folder.
+            CheckpointError: If another training is using the folder.
         """
         self._take()
         for leftover in self.path.glob(".*.tmp"):  # of a process that was killed

@@ -47,17 +47,17 @@ def train(
     torchrun started several processes, each trains on its share of the envs.
 
     Args:
-        config: task, learner, budget and folder.
-        resume: go on from the folder's last checkpoint, if there is one.
-        envs: vector of this rank's envs to use (and leave open) instead of making one.
+        config: Task, learner, budget and folder.
+        resume: Go on from the folder's last checkpoint, if there is one.
+        envs: Vector of this rank's envs to use (and leave open) instead of making one.
 
     Raises:
-        CheckpointError: if the folder or its checkpoint cannot be used.
-        ConfigError: if the envs cannot be shared evenly among the ranks, those given
+        CheckpointError: If the folder or its checkpoint cannot be used.
+        ConfigError: If the envs cannot be shared evenly among the ranks, those given
             are others than the config says, or an evaluation has too few episodes.
-        RankError: if another rank failed.
-        TrainingDivergedError: if a number stopped being finite.
-        WorkerError: if a simulator process died or hangs.
+        RankError: If another rank failed.
+        TrainingDivergedError: If a number stopped being finite.
+        WorkerError: If a simulator process died or hangs.
     """
     with contextlib.ExitStack() as leaving:
         leaving.enter_context(distributed.group())
@@ -307,7 +307,7 @@ class Trainer:
         """Go on from the folder's last checkpoint.
 
         Raises:
-            CheckpointError: if it is broken, or of another task or config.
+            CheckpointError: If it is broken, or of another task or config.
         """
         path = self.folder.last
         stored = distributed.from_first(lambda: checkpoint.read(path))

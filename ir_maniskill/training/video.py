@@ -97,7 +97,7 @@ def record(
     env_kwargs: dict[str, Any] | None = None,
     instructions: Sequence[int] | None = None,
 ) -> Iterator[Snapshot]:
-    """Plays episodes and yields every step; instructions take turns.
+    """Play episodes and yield every step; instructions take turns.
 
     Args:
         policy: Acts without noise on the state s_t.
@@ -147,7 +147,7 @@ class _Stage:
         self._env.reset(seed=0)
 
     def show(self, state: dict[str, Any]) -> np.ndarray:
-        """Returns the human view [H, W, 3] uint8 of a state of the other scene."""
+        """Return the human view [H, W, 3] uint8 of a state of the other scene."""
         base: Any = self._env.unwrapped
         base.set_state_dict(state)
         return _picture(self._env.render())
@@ -160,7 +160,7 @@ class _Stage:
 def _play(
     policy: Policy, env: gym.Env, obs: Any, stack: StateStack, stage: _Stage
 ) -> Iterator[Snapshot]:
-    """Plays the episode that a reset has begun."""
+    """Play the episode that a reset has begun."""
     base: Any = env.unwrapped
     state, total = stack.reset(obs), base.experiment.episode_steps
     right = wrong = [False] * len(base.agent.fingers)
@@ -190,7 +190,7 @@ def _play(
 
 
 def _picture(tensor: Any) -> np.ndarray:
-    """Returns a rendered batch of one as an image [H, W, 3] uint8."""
+    """Return a rendered batch of one as an image [H, W, 3] uint8."""
     array = torch.as_tensor(tensor).cpu().numpy()
     return array[0] if array.ndim == 4 else array
 
@@ -204,7 +204,7 @@ def _camera_pictures(obs: dict[str, Any]) -> tuple[np.ndarray, ...]:
 
 
 def draw(snapshot: Snapshot) -> np.ndarray:
-    """Draws a frame [720, 1280, 3] uint8."""
+    """Draw a frame [720, 1280, 3] uint8."""
     page = _page().copy()
     _paste(page, snapshot.view, VIEW, radius=14)
     for picture, box in zip(snapshot.cameras, PICTURES, strict=False):
@@ -225,7 +225,7 @@ def _font(size: int) -> Any:
 
 @cache
 def _page() -> Image.Image:
-    """What is the same in every frame."""
+    """Draw what is the same in every frame."""
     page = Image.new("RGB", SIZE, PAGE)
     canvas = ImageDraw.Draw(page)
     canvas.text((33, 24), "INSTRUCTION", FAINT, _font(13))
@@ -250,7 +250,7 @@ def _label_cameras(canvas: ImageDraw.ImageDraw, pictures: Sequence[np.ndarray]) 
 
 @cache
 def _mask(width: int, height: int, radius: int) -> Image.Image:
-    """A rounded rectangle, drawn large and shrunk for smooth corners."""
+    """Draw a rounded rectangle large, and shrink it for smooth corners."""
     large = Image.new("L", (4 * width, 4 * height))
     area = (0, 0, 4 * width - 1, 4 * height - 1)
     ImageDraw.Draw(large).rounded_rectangle(area, 4 * radius, 255)
@@ -258,7 +258,7 @@ def _mask(width: int, height: int, radius: int) -> Image.Image:
 
 
 def _paste(page: Image.Image, array: np.ndarray, box: Box, radius: int) -> None:
-    """Pastes a picture into a box, cropped to the box's shape."""
+    """Paste a picture into a box, cropped to the box's shape."""
     x, y, width, height = box
     picture = Image.fromarray(np.ascontiguousarray(array))
     if picture.size != (width, height):
@@ -278,7 +278,7 @@ def _paste_shape(page: Image.Image, box: Box, color: Color, radius: int) -> None
 
 
 def _draw_timeline(canvas: ImageDraw.ImageDraw, snapshot: Snapshot) -> None:
-    """One cell a step: green above if right, red below if wrong, else grey."""
+    """Draw one cell a step: green above if right, red below if wrong, else gray."""
     x, y, width, height = TIMELINE
     total = snapshot.total_steps
     gap = 3 if total <= 100 else 0
@@ -296,7 +296,7 @@ def _draw_timeline(canvas: ImageDraw.ImageDraw, snapshot: Snapshot) -> None:
 
 
 def _draw_hands(page: Image.Image, snapshot: Snapshot) -> None:
-    """A row of lights for each hand, in the order of the robot's fingers."""
+    """Draw a row of lights for each hand, in the order of the robot's fingers."""
     x, y, _, _ = HANDS
     canvas = ImageDraw.Draw(page)
     hands: dict[str, list[tuple[str, Color]]] = {}
@@ -314,7 +314,7 @@ def _draw_hands(page: Image.Image, snapshot: Snapshot) -> None:
 
 
 def _titles(finger: str) -> tuple[str, str]:
-    """Splits "LFinger1" into "LEFT" and "Finger 1"; other names have no hand."""
+    """Split "LFinger1" into "LEFT" and "Finger 1"; other names have no hand."""
     parts = re.fullmatch(r"([LR])([A-Z][a-z]+)(\d*)", finger)
     if parts is None:
         return "", finger
@@ -325,7 +325,7 @@ def _titles(finger: str) -> tuple[str, str]:
 def _draw_light(
     page: Image.Image, place: tuple[int, int], name: str, color: Color
 ) -> None:
-    """A light with its name; it glows unless its color is that of an edge."""
+    """Draw a light with its name; it glows unless its color is that of an edge."""
     left, top = place
     if color != EDGE:
         _paste_shape(page, (left + 14, top - 5, 32, 32), _dim(color), 16)
@@ -336,7 +336,7 @@ def _draw_light(
 
 
 def _dim(color: Color) -> Color:
-    """Mixes a color into the card's, for the glow around a light."""
+    """Mix a color into the card's, for the glow around a light."""
     red, green, blue = ((c + 2 * d) // 3 for c, d in zip(color, CARD, strict=True))
     return red, green, blue
 
@@ -361,7 +361,7 @@ def _draw_counters(canvas: ImageDraw.ImageDraw, snapshot: Snapshot) -> None:
 def write_video(
     path: Path, snapshots: Iterable[Snapshot], *, speed: float = 0.5, hold: float = 1.0
 ) -> int:
-    """Draws snapshots into an mp4, or into a small GIF if the name ends so.
+    """Draw snapshots into an mp4, or into a small GIF if the name ends so.
 
     Args:
         path: The file.
@@ -397,13 +397,13 @@ def write_video(
 
 
 def check_name(path: Path) -> None:
-    """Raises ValueError unless the name ends in .mp4 or .gif."""
+    """Raise ValueError unless the name ends in .mp4 or .gif."""
     if path.suffix not in (".mp4", ".gif"):
         raise ValueError(f"video: got {path}, expected a name ending in .mp4 or .gif")
 
 
 def _write_mp4(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
-    """H.264 with 4:2:0 colors, which every player knows."""
+    """Write H.264 with 4:2:0 colors, which every player knows."""
     tuning = ["-crf", "20", "-preset", "medium", "-movflags", "+faststart"]
     options: dict[str, Any] = {"pixelformat": "yuv420p", "quality": None}
     writer: Any = imageio.get_writer(
@@ -420,7 +420,7 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
 
 
 def _palette(images: Sequence[Image.Image]) -> Image.Image:
-    """Chooses colors for a film by some of its frames.
+    """Choose colors for a film by some of its frames.
 
     The octree keeps small things of a color of their own, such as a cube, apart; the
     median cut merges them into what is large.
@@ -433,7 +433,7 @@ def _palette(images: Sequence[Image.Image]) -> Image.Image:
 
 
 def _write_gif(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
-    """Half the size, and one palette for all frames, to stay small."""
+    """Write half the size, with one palette for all frames, to stay small."""
     size = (SIZE[0] // 2, SIZE[1] // 2)
     images = [
         Image.fromarray(frame).resize(size, Image.Resampling.LANCZOS)
