@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 import torch
 
 from ir_maniskill.environment.robot.nao import FINGERS, JOINTS, Nao
-from ir_maniskill.environment.robot.robot import Robot, RobotError
+from ir_maniskill.environment.robot.robot import Robot, RobotError, TargetController
 from ir_maniskill.environment.touch_env import TouchEnv
 
 ABSOLUTE, DELTA = "pd_joint_pos", "pd_joint_target_delta_pos"
@@ -122,15 +123,40 @@ def test_a_reset_to_a_state_restores_its_targets_too(env: TouchEnv) -> None:
     torch.testing.assert_close(env.agent.controller.target, qpos)
 
 
-def test_a_reset_of_other_envs_leaves_the_targets(env: TouchEnv) -> None:
-    env.reset(seed=0)
-    env.step(action(env, LWristYaw=0.5))
-    wanted, everyone = env.agent.controller.target.clone(), env.scene._reset_mask
-    env.scene._reset_mask = ~everyone  # as in a batch, until the scene is laid out
-    env.agent.reset()
-    env.scene._reset_mask = everyone
-    env.agent.controller.reset()
-    assert torch.equal(env.agent.controller.target, wanted)
+def test_of_a_batch_the_envs_being_reset_alone_get_new_targets() -> None:
+    class Batch(TargetController):
+        """On a stand-in for a GPU's three envs with two joints."""
+
+        def __init__(self) -> None:
+            self.scene = SimpleNamespace(gpu_sim_enabled=True, _reset_mask=everyone)
+            send = SimpleNamespace(set_joint_drive_targets=lambda t, *_: sent.append(t))
+            self.articulation, self.joints = send, []
+            self.active_joint_indices = torch.arange(2)
+            self.lower, self.upper = -torch.ones(2), torch.ones(2)
+
+        @property
+        def qpos(self) -> torch.Tensor:
+            return torch.full((3, 2), 0.5)
+
+    everyone, some = torch.ones(3, dtype=bool), torch.tensor([True, False, True])
+    sent: list[torch.Tensor] = []
+    controller = Batch()
+    controller.reset()
+    controller.set_state({"target_qpos": torch.zeros(3, 2)})
+    for restored, expected in ((False, [0.5, 0, 0.5]), (True, [0.25, 0.5, 0.25])):
+        controller.scene._reset_mask = some  # as ManiSkill does, until all is in place
+        controller.begin_reset()
+        if restored:
+            controller.set_state({"target_qpos": torch.tensor(rows([0.25, 0.5, 0.25]))})
+            assert sent[-1].tolist() == rows([0.25, 0.25])
+        controller.scene._reset_mask = everyone
+        controller.reset()
+        assert controller.target.tolist() == sent[-1].tolist() == rows(expected)
+
+
+def rows(values: list[float]) -> list[list[float]]:
+    """Return a row of two joints for each value."""
+    return [[value, value] for value in values]
 
 
 def test_joints_without_a_motors_limits_are_named(tmp_path: Path) -> None:
