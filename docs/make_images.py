@@ -36,6 +36,7 @@ FILMS = (
     "NaoTouchCubeShuffled-v1",
     "NaoTouchButtonMulti-v1",
     "NaoTouchButtonTriangle-v1",
+    "NaoTouchButtonShuffled-v1",
 )
 """The tasks of which there is a film."""
 
