@@ -303,20 +303,15 @@ class ProcessVectorEnv(VectorEnv):
 
         Args:
             name: Of the attribute.
-            values: A list or tuple of N values, one each, or one value for all.
+            values: A list, array or tensor of N values, one each, or one for all.
 
         Raises:
             ValueError: The list has not N values.
             WorkerError: A worker died or hangs, or has not answered the last command.
         """
-        if not isinstance(values, list | tuple):
-            values = [values] * self.num_envs
-        if len(values) != self.num_envs:
-            raise ValueError(
-                f"{name}: got {len(values)} values, expected {self.num_envs}"
-            )
+        each = _values(name, values, self.num_envs)
         self._command(
-            "set_attr", [(name, [values[r] for r in rows]) for rows in self._rows]
+            "set_attr", [(name, [each[row] for row in rows]) for rows in self._rows]
         )
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -418,20 +413,23 @@ def seeds_of(seed: int | Sequence[int], num_envs: int) -> list[int]:
 
 def _deal(options: dict[str, Any], num_envs: int) -> Iterator[dict[str, Any]]:
     """Yield the options of each env: its own of N values, else what all get."""
-    values = {name: _values(name, given, num_envs) for name, given in options.items()}
+    values = {
+        name: _values(f"reset option {name!r}", given, num_envs)
+        for name, given in options.items()
+    }
     for row in range(num_envs):
         yield {name: value[row] for name, value in values.items()}
 
 
-def _values(name: str, given: Any, num_envs: int) -> list:
-    """Return each env's value of an option."""
+def _values(what: str, given: Any, num_envs: int) -> list:
+    """Return each env's value of what is given for all or one each."""
     if isinstance(given, Tensor | np.ndarray):
         given = given.tolist()
     if not isinstance(given, list | tuple):
         return [given] * num_envs
     if len(given) != num_envs:
         raise ValueError(
-            f"reset option {name!r}: got {len(given)} values, expected {num_envs}, "
+            f"{what}: got {len(given)} values, expected {num_envs}, "
             "one for each env, or a single one for all"
         )
     return list(given)
