@@ -32,8 +32,9 @@ def score(success=1.0, exclusive=0.5, touching=0.8, fingers=3.0, episodes=200):
 def make_run(seed=0, preset="default", fingers=(1.0, 3.2), report=None, **changes):
     config = json.loads(to_json(CONFIGS[preset]))
     config |= {"env_id": TRIANGLE, "seed": seed, **changes}
+    shares = [{"eval/success": float(i), "eval/exclusive": 0.1 * i} for i in range(4)]
     rows = [
-        {"steps": 1000.0 * (i + 1), "eval/right_fingers": f, "eval/exclusive": 0.1 * i}
+        {"steps": 1000.0 * (i + 1), "eval/right_fingers": f, **shares[i]}
         for i, f in enumerate(fingers)
     ]
     report = report or {"instructions": {BLUE: score()}}
@@ -176,13 +177,17 @@ def test_ablations_are_the_runs_that_differ_from_the_default_in_one_field():
 
 
 def test_presets_are_compared_by_the_steps_to_the_same_levels():
-    groups = results.grouped(
-        [make_run(0), make_run(1, fingers=(3.1, 0)), make_run(0, "paper", (0, 0, 3.2))]
+    paper, blind = (
+        make_run(0, "paper", (0, 0, 3.2)),
+        make_run(0, "paper", (0, 3.2), camera_width=16),
     )
+    groups = results.grouped([make_run(0), make_run(1, fingers=(3.1, 0)), paper, blind])
     text = results.paper_table(groups)
-    assert cells(text, 1)[2:] == ["2 k, 1 k", "3 k", "2 k"]
-    assert cells(text, 0)[2:4] == ["never", "never"]
-    assert results.rivals(groups[:1]) == {}
+    assert cells(text, 2)[2:] == ["2 k, 1 k", "`paper`", "3 k", "2 k"]
+    assert cells(text, 0)[2:5] == ["2 k, 2 k", "`paper`", "2 k"]
+    assert cells(text, 1)[2] == cells(text, 1)[4] == "never"
+    assert cells(text, 5)[3:5] == ["`paper`, camera_width 16", "2 k"]
+    assert results.rivals(groups[:1]) == results.rivals(groups[1:]) == {}
 
 
 def test_a_policy_is_told_every_sentence_in_the_same_scene():
