@@ -68,9 +68,9 @@ paper's preset was trained."""
 ONE_SETTING = """\
 ## What one setting changes
 
-Runs that differ from the preset `default` in one field, beside the preset itself: each
-figure in the end is the lowest over sentences and seeds; then exclusive success of both
-in the choosing evaluations after equally many steps."""
+Runs that change one field more than others, beside those others: each figure in the end
+is the lowest over sentences and seeds; then exclusive success of both in the choosing
+evaluations after equally many steps."""
 
 OBEYS = 0.95
 """Share of episodes from which a way of learning counts as successful."""
@@ -447,39 +447,42 @@ def fingers_table(
     return table(head, rows)
 
 
-def ablations(groups: Iterable[Group]) -> dict[str, list[Group]]:
-    """Return for each task the `default` preset and all that differ in one field.
+def ablations(groups: Sequence[Group]) -> list[list[Group]]:
+    """Return each way of learning with all that differ from it in one more field.
 
-    Tasks with only one of both have nothing to compare and are left out.
+    Those with nothing to be compared with are left out.
     """
-    found: dict[str, list[Group]] = {}
-    for group in groups:
-        run = group.runs[0]
-        if run.preset == "default" and len(run.changes) <= 1:
-            found.setdefault(group.task, []).append(group)
-    # Groups come with the fewest changes first, so that the preset leads its own.
-    return {
-        task: group
-        for task, group in found.items()
-        if len(group) > 1 and not group[0].runs[0].changes
-    }
+    found = [
+        [base, *(group for group in groups if len(beyond(group, base)) == 1)]
+        for base in groups
+    ]
+    return [each for each in found if len(each) > 1]
 
 
-def ablations_table(groups: Iterable[Group]) -> str:
+def beyond(group: Group, base: Group) -> set[str]:
+    """Return what a group changes beyond another that changes all else likewise."""
+    (one, *_), (other, *_) = group.runs, base.runs
+    if (one.task, one.preset) != (other.task, other.preset):
+        return set()
+    more, less = set(one.changes), set(other.changes)
+    return more - less if more > less else set()
+
+
+def ablations_table(groups: Sequence[Group]) -> str:
     """Return what one field changes: in the end, and after equally many steps."""
     head = (
         *("task", "changed", "seeds", "steps", "success", "exclusive", "touching"),
-        *("right fingers", "exclusive after", "this", "default"),
+        *("right fingers", "exclusive after", "this", "unchanged"),
     )
     rows = []
-    for task, (default, *others) in ablations(groups).items():
-        for group in (default, *others):
-            steps = min(default.last_step(), group.last_step())
-            same = [f"{100 * g.after(steps, EXCLUSIVE):.0f}%" for g in (group, default)]
+    for base, *others in ablations(groups):
+        for group in (base, *others):
+            steps = min(base.last_step(), group.last_step())
+            same = [f"{100 * g.after(steps, EXCLUSIVE):.0f}%" for g in (group, base)]
             rows.append(
                 (
-                    f"`{task}`",
-                    ", ".join(group.runs[0].changes) or "nothing",
+                    f"`{base.task}`",
+                    ", ".join(beyond(group, base)) or f"nothing: {base.label}",
                     *group.effort[:2],
                     *_reached(group),
                     *(f"{steps / 1000:.0f} k", *same),
@@ -616,7 +619,9 @@ def pictures(groups: Sequence[Group], shipped: Mapping[str, Figures]) -> Picture
     """Return what to draw: the curves in each picture, by section and name."""
     main = {task: [group] for task, group in chosen(groups, shipped).items()}
     both = {f"{task}-paper": each for task, each in rivals(groups).items()}
-    one = {f"{task}-ablations": each for task, each in ablations(groups).items()}
+    one: dict[str, list[Group]] = {}
+    for task, each in groupby(ablations(groups), key=lambda each: each[0].task):
+        one |= {f"{task}-ablations{n or ''}": pair for n, pair in enumerate(each)}
     return {"curves": main, "paper": both, "ablations": one}
 
 

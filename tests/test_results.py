@@ -159,21 +159,25 @@ def changed(seed, **agent):
     return make_run(seed, agent=config | agent)
 
 
-def test_ablations_are_the_runs_that_differ_from_the_default_in_one_field():
+def test_ablations_are_the_runs_that_differ_from_others_in_one_field():
     far = make_run(8, fingers=(1, 1, 1, 1), reward_mode="sparse")
     both = changed(7, film=False, auxiliary_weight=0.0)
     groups = results.grouped(
         [make_run(0), both, changed(3, film=False), far, make_run(4, "paper")]
     )
-    (found,) = results.ablations(groups).values()
+    found, further = results.ablations(groups)
     changes = [group.runs[0].changes for group in found]
     assert changes == [[], ["agent.film False"], ["reward_mode sparse"]]
+    assert [results.beyond(group, further[0]) for group in further] == [
+        set(),
+        {"agent.auxiliary_weight 0.0"},
+    ]
     text = results.ablations_table(groups)
     # Exclusive success grows by 0.1 every 1000 steps; the default stops at 2000.
-    assert cells(text, 0)[1] == "nothing" and cells(text, 2)[3] == "2 k"
+    assert cells(text, 0)[1] == "nothing: `default`" and cells(text, 2)[3] == "2 k"
     assert cells(text, 2)[-3:] == ["2 k", "10%", "10%"]
-    assert results.ablations(results.grouped([changed(3, film=False)])) == {}
-    assert results.ablations(results.grouped([make_run(0)])) == {}
+    assert results.ablations(results.grouped([changed(3, film=False)])) == []
+    assert results.ablations(results.grouped([make_run(0)])) == []
 
 
 def test_presets_are_compared_by_the_steps_to_the_same_levels():
