@@ -65,8 +65,7 @@ PAPER_SETTINGS = """\
 The preset `paper` on the same tasks and in the same scenes: after how many steps a
 choosing evaluation first reached the level named, for each seed; *of* says how long the
 paper's preset was trained. With pictures an update takes it some ten minutes on two
-cores; with the simulator's state in their place it is told all, so that its steps are
-at most as many as it would need."""
+cores; told all by the simulator's state in their place, it should need fewer steps."""
 ONE_SETTING = """\
 ## What one setting changes
 
