@@ -492,24 +492,22 @@ def ablations_table(groups: Sequence[Group]) -> str:
     return table(head, rows)
 
 
-def rivals(groups: Iterable[Group]) -> dict[str, list[Group]]:
+def rivals(groups: Sequence[Group]) -> dict[str, list[Group]]:
     """Return for each task the preset `default` and the ways nearest to `paper`.
 
     Tasks with only one of both have nothing to compare and are left out.
     """
-    found: dict[str, list[Group]] = {}
-    for group in groups:
-        if group.label == "`default`" or group.runs[0].preset == "paper":
-            found.setdefault(group.task, []).append(group)
-    found = {task: sorted(pair, key=_papers) for task, pair in found.items()}
-    return {t: g for t, g in found.items() if not _papers(g[0]) and _papers(g[-1])}
+    found = {}
+    for task in tasks():
+        own = [group for group in groups if group.task == task]
+        ours = [group for group in own if group.label == "`default`"]
+        papers = [group for group in own if group.runs[0].preset == "paper"]
+        if ours and papers:
+            found[task] = ours + papers
+    return found
 
 
-def _papers(group: Group) -> bool:
-    return group.runs[0].preset == "paper"
-
-
-def paper_table(groups: Iterable[Group]) -> str:
+def paper_table(groups: Sequence[Group]) -> str:
     """Return how many steps both presets take to the same levels."""
     head = ("task", "level", "`default` after", "the paper's", "after", "of")
     rows = []
