@@ -12,6 +12,7 @@ from ir_maniskill.agent.perceptual_system import PaperVision, PatchVision, pixel
 from ir_maniskill.training.config import CONFIGS, AgentConfig
 
 TOKENS, ACTIONS = 5, 26
+DELTA = 0.2
 
 
 def make_state(n=4, height=64, width=32, privileged=50):
@@ -132,11 +133,36 @@ def test_film_lets_the_sentence_reach_the_convolutions():
 
 def test_first_actions_are_near_the_middle_with_the_given_deviation():
     actor = Actor(10, (500, 256, 128), ACTIONS, std=0.36, learn_std=False)
-    policy = actor(torch.randn(64, 10))
+    policy = actor(torch.randn(64, 10), torch.rand(64, ACTIONS))
     assert policy.mean.abs().max() < 0.1
     assert torch.allclose(policy.stddev, torch.tensor(0.36))
     actor.set_std(0.2)
-    assert torch.allclose(actor(torch.zeros(1, 10)).stddev, torch.tensor(0.2))
+    policy = actor(torch.zeros(1, 10), torch.zeros(1, ACTIONS))
+    assert torch.allclose(policy.stddev, torch.tensor(0.2))
+
+
+def test_with_a_posture_gain_targets_go_to_the_posture_and_stay_there():
+    sizes = {"std": 0.5, "learn_std": False}
+    actor = Actor(10, (20,), ACTIONS, **sizes, posture_gain=0.5)
+    posture = torch.linspace(-0.9, 0.9, ACTIONS)
+    actor.mean[-1].bias.data.copy_(0.5 * posture)
+    aligned, target = torch.zeros(8, 10), torch.rand(8, ACTIONS)
+    target[0] = posture
+    assert torch.allclose(actor(aligned, target).mean[0], torch.zeros(1), atol=1e-6)
+    for _ in range(100):
+        target = target + DELTA * actor(aligned, target).mean.clamp(-1, 1)
+    assert torch.allclose(target, posture.expand(8, -1), atol=1e-3)
+
+
+def test_the_newest_joint_targets_are_what_the_posture_is_compared_with():
+    state = make_state()
+    agent = make_agent(state, posture_gain=2.0, senses=("touch", "proprioception"))
+    before = agent.policy(state)
+    agent.encoder.forward = lambda _: torch.zeros(4, agent.encoder.width)
+    state["target"] = torch.zeros(4, 3, ACTIONS)
+    state["target"][:, 0] = 0.25
+    assert before.shape == (4, ACTIONS)
+    assert torch.allclose(agent.policy(state), torch.tensor(-0.5), atol=1e-6)
 
 
 def test_only_a_learned_deviation_is_a_parameter():

@@ -107,6 +107,8 @@ def test_files_from_before_a_field_was_added_keep_their_meaning():
     data = json.loads(to_json(TrainConfig()))
     for field in LATER["TrainConfig"]:
         del data[field]
+    for field in LATER["AgentConfig"]:
+        del data["agent"][field]
     assert from_json(json.dumps(data)) == TrainConfig()
 
 
@@ -154,6 +156,24 @@ def test_whatever_a_config_says_it_is_a_config_or_refused(path, value):
         (lambda: AgentConfig(body_width=0), "body_width: got 0, expected at least 1"),
         (lambda: TrainConfig(reward_mode="none"), "reward_mode: got 'none', expected"),
         (lambda: AgentConfig(std=0.0), "std: got 0.0, expected more than 0"),
+        (
+            lambda: AgentConfig(posture_gain=-1.0),
+            "posture_gain: got -1.0, expected a finite number of at least 0",
+        ),
+        (
+            lambda: AgentConfig(posture_gain=1.0, senses=("vision", "touch")),
+            "posture_gain: got 1.0, expected 0 where the actor does not feel",
+        ),
+        (
+            lambda: AgentConfig(posture_gain=1.0, sees_target=False),
+            "posture_gain: got 1.0, expected 0 where the actor does not feel",
+        ),
+        (
+            lambda: TrainConfig(
+                control_mode="pd_joint_pos", agent=AgentConfig(posture_gain=1.0)
+            ),
+            "posture_gain: got 1.0, expected 0 where actions do not change",
+        ),
         (lambda: PPOConfig(gamma=1.1), "gamma: got 1.1, expected 0 to 1"),
         (lambda: PPOConfig(minibatch=1), "minibatch: got 1, expected 2 to 2048"),
         (lambda: TrainConfig(total_steps=0), "total_steps: got 0"),

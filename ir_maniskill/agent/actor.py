@@ -24,7 +24,12 @@ def tanh_layers(
 
 
 class Actor(nn.Module):
-    """pi(a|s): a Gaussian whose mean is read from B_t, whose deviation is not."""
+    """pi(a|s): a Gaussian whose mean is read from B_t, whose deviation is not.
+
+    With a `posture_gain` g the mean is g (p - q), where q are the joint targets and
+    g p is what the layers give: as long as that stays, changes of the targets bring
+    them to the posture p and hold them there, whatever noise did to them before.
+    """
 
     log_std: Tensor
 
@@ -36,9 +41,11 @@ class Actor(nn.Module):
         *,
         std: float,
         learn_std: bool,
+        posture_gain: float = 0.0,
     ) -> None:
-        """Make the layers; at first every mean is near 0, the middle of each joint."""
+        """Make the layers; at first they give about 0, the middle of each joint."""
         super().__init__()
+        self.posture_gain = posture_gain
         self.mean = tanh_layers(inputs, hidden, actions, gain=0.01)
         log_std = torch.full((actions,), math.log(std))
         if learn_std:
@@ -46,9 +53,16 @@ class Actor(nn.Module):
         else:
             self.register_buffer("log_std", log_std)
 
-    def forward(self, aligned: Tensor) -> Normal:
-        """Return the distribution of a_t [N, A] given B_t [N, D]."""
+    def forward(self, aligned: Tensor, target: Tensor) -> Normal:
+        """Return the distribution of a_t [N, A].
+
+        Args:
+            aligned: B_t [N, D].
+            target: The joint targets [N, A] in [-1, 1]; unused without `posture_gain`.
+        """
         mean = self.mean(aligned)
+        if self.posture_gain:
+            mean = mean - self.posture_gain * target
         std = self.log_std.exp().expand_as(mean)
         return Normal(mean, std, validate_args=False)
 

@@ -6,6 +6,7 @@ our tuned values; both run the same code.
 
 import dataclasses
 import json
+import math
 import types
 import typing
 from dataclasses import dataclass, field
@@ -66,6 +67,9 @@ class AgentConfig:
     """Units of V_t."""
     body_width: int = 128
     """Units of H_t."""
+    posture_gain: float = 0.0
+    """How strongly mean actions, changes of the joint targets, draw these toward the
+    posture that the actor's layers then give; 0: the layers give the action itself."""
     hidden: tuple[int, ...] = (500, 256, 128)
     """Units of the actor's and the critic's tanh layers."""
     critic: CriticInput = "asymmetric"
@@ -104,6 +108,14 @@ class AgentConfig:
         _require(self.std_final > 0, "std_final", self.std_final, "more than 0")
         weight = self.auxiliary_weight
         _require(weight >= 0, "auxiliary_weight", weight, "0 or more")
+        gain, senses = self.posture_gain, self.senses
+        _require(
+            0 <= gain < math.inf, "posture_gain", gain, "a finite number of at least 0"
+        )
+        felt = senses is None or bool({"proprioception", "state"} & set(senses))
+        fits = gain == 0 or (felt and self.sees_target)
+        expected = "0 where the actor does not feel its joint targets"
+        _require(fits, "posture_gain", gain, expected)
 
 
 @dataclass(frozen=True)
@@ -233,6 +245,10 @@ class TrainConfig:
         for name, bits in (("seed", 31), ("eval_seed", 29)):
             value = getattr(self, name)
             _require(0 <= value < 2**bits, name, value, f"0 to 2**{bits} - 1")
+        gain = self.agent.posture_gain
+        fits = gain == 0 or self.control_mode == "pd_joint_target_delta_pos"
+        expected = "0 where actions do not change the joint targets (control_mode)"
+        _require(fits, "posture_gain", gain, expected)
         rollouts = self.ppo.rollouts
         fits = rollouts % self.num_envs == 0
         _require(fits, "num_envs", self.num_envs, f"a divisor of {rollouts} rollouts")
@@ -319,7 +335,10 @@ CONFIGS: dict[str, TrainConfig] = {
 """The named configurations: "paper" as published, "default" as tuned."""
 
 
-LATER: dict[str, dict[str, object]] = {"TrainConfig": {"lenient_steps": 0}}
+LATER: dict[str, dict[str, object]] = {
+    "AgentConfig": {"posture_gain": 0.0},
+    "TrainConfig": {"lenient_steps": 0},
+}
 """Fields that older files lack, by class, with the values that those files meant."""
 
 
