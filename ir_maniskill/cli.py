@@ -57,8 +57,8 @@ class Train:
     """Train an agent."""
 
     config: Annotated[TrainOptions, arg(name="")]
-    preset: Literal["default", "paper"] = "default"
-    """Which numbers to start from: ours or the paper's."""
+    preset: Literal["default", "posture", "paper"] = "default"
+    """Which numbers to start from: ours, ours where each finger counts, the paper's."""
     resume: bool = False
     """Go on from the last checkpoint of the folder, if there is one."""
 

@@ -136,7 +136,7 @@ class Run:
         """How to train it with today's presets."""
         changes = self._changes(self.preset, UNCOPIED).items()
         flags = [f"--out runs/{self.name}"]
-        flags += ["--preset paper"] if self.preset == "paper" else []
+        flags += [f"--preset {self.preset}"] if self.preset != "default" else []
         flags += [_flag(key, value) for key, value in changes]
         return " ".join([f"ir-maniskill train {self.task}", *flags])
 

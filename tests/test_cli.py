@@ -100,7 +100,7 @@ def test_an_unknown_instruction_lists_those_there_are(capsys, policy_file):
         (["video", IDS[0], "--speed", "0"], "speed: got 0"),
         (["video", IDS[0], "--out", "film.avi"], "film.avi"),
         (["train", IDS[0], "--num-envs", "7"], "num_envs: got 7"),
-        (["train", IDS[0], "--preset", "fast"], "default, paper"),
+        (["train", IDS[0], "--preset", "fast"], "default, posture, paper"),
         (["curve", "/nowhere"], "/nowhere"),
         (["video", IDS[0], "--out", "/dev/null/film.mp4"], "cannot write /dev/null/f"),
         (["evaluate", IDS[0], "--json", "/dev"], "cannot write /dev: Is a directory"),
@@ -130,7 +130,7 @@ def trained_with(monkeypatch, *arguments):
     return calls[0]
 
 
-@pytest.mark.parametrize("preset", ["default", "paper"])
+@pytest.mark.parametrize("preset", CONFIGS)
 def test_a_preset_gives_every_number_but_id_and_folder(preset, monkeypatch):
     config, resume = trained_with(monkeypatch, IDS[2], "--preset", preset)
     out = f"runs/{IDS[2]}"

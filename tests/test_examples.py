@@ -80,7 +80,7 @@ def test_train_knows_the_three_experiments_of_the_paper() -> None:
     example = runpy.run_path(script("train.py"))
     assert set(example["TASKS"].values()) <= set(available())
     for experiment in ("single", "multi", "triangle"):
-        for preset in ("default", "paper"):
+        for preset in example["STEPS"]:
             config = example["configure"](experiment, preset, None, None)
             assert experiment in config.env_id.lower()
             assert config.total_steps == example["STEPS"][preset][experiment]
