@@ -67,7 +67,7 @@ def learning_curve(run: Path, out: Path | None = None) -> Path:
 
 @dataclass(frozen=True)
 class Curve:
-    """Runs that differ by their seeds only."""
+    """Runs that differ by chance only, mostly by their seeds."""
 
     label: str
     """What the legend calls them."""
@@ -97,8 +97,8 @@ class Curve:
 def compare(curves: Sequence[Curve], out: Path, level: float | None = None) -> Path:
     """Draw ways of learning side by side.
 
-    Each has a line for the mean of its seeds and a band for their range, as far as all
-    of them reach, and a thin line for every seed.
+    Each has a line for the mean of its runs and a band for their range, as far as all
+    of them reach, and a thin line for every run.
 
     Args:
         curves: At least one.
@@ -150,8 +150,8 @@ def _draw_range(
     values = scale * values
     common = np.isfinite(values).all(axis=0)  # steps that every seed has reached
     shared = values[:, common]
-    seeds = f"{len(curve.runs)} seed{'s' if len(curve.runs) > 1 else ''}"
-    label = f"{curve.label} ({seeds})"
+    runs = f"{len(curve.runs)} run{'s' if len(curve.runs) > 1 else ''}"
+    label = f"{curve.label} ({runs})"
     mean, low, high = shared.mean(axis=0), shared.min(axis=0), shared.max(axis=0)
     axes.plot(steps[common], mean, "o-", color=color, ms=3, label=label)
     axes.fill_between(steps[common], low, high, color=color, alpha=0.18, linewidth=0)
