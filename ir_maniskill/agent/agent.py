@@ -207,7 +207,7 @@ class Agent(nn.Module):
     def act(self, state: State, deterministic: bool = False) -> Act:
         """Return an action for each state: sampled, or the policy's mean."""
         aligned = self.encoder(state)
-        policy = self._act(state, aligned)
+        policy = self._distribution(state, aligned)
         action = policy.mean if deterministic else policy.sample()
         log_prob = policy.log_prob(action).sum(-1)
         return Act(action, log_prob, self._value(state, aligned))
@@ -223,7 +223,7 @@ class Agent(nn.Module):
         self.spec.require(state, needed)
         device = self.actor.log_std.device
         here = {key: value.to(device) for key, value in state.items()}
-        return self._act(here, self.encoder(here)).mean.clamp(-1, 1)
+        return self._distribution(here, self.encoder(here)).mean.clamp(-1, 1)
 
     def value(self, state: State) -> Tensor:
         """Return the value of each state [N]."""
@@ -233,7 +233,7 @@ class Agent(nn.Module):
     def evaluate_actions(self, state: State, action: Tensor) -> Judgement:
         """Return how likely the actions [N, A] are now, and the states' values."""
         aligned = self.encoder(state)
-        policy = self._act(state, aligned)
+        policy = self._distribution(state, aligned)
         return Judgement(
             policy.log_prob(action).sum(-1),
             policy.entropy().sum(-1),
@@ -247,7 +247,7 @@ class Agent(nn.Module):
             if encoder is not None and encoder.standardize is not None:
                 encoder.standardize.update(privileged)
 
-    def _act(self, state: State, aligned: Tensor) -> Normal:
+    def _distribution(self, state: State, aligned: Tensor) -> Normal:
         return self.actor(aligned, state["target"][:, 0])
 
     def _value(self, state: State, aligned: Tensor | None) -> Tensor:
