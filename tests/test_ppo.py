@@ -173,15 +173,25 @@ def test_policy_loss_is_clipped_by_hand():
 
 
 def test_value_entropy_and_auxiliary_losses_by_hand():
-    agent = judged([0.0, 0.0], value=[1.0, 3.0], target=torch.full((2, 3), 0.3))
+    agent = judged([0.0, 0.0], value=[1.0, 3.0], target=torch.full((2, 3), 0.15))
     config = PPOConfig(value_weight=0.5, entropy_weight=0.1)
     place = {"named_position": torch.full((2, 3), 0.1)}
     loss, terms = ppo.ppo_loss(
         agent, batch_of([1.0, -1.0], (0.0, 0.0), **place), config
     )
     assert float(terms["value"]) == pytest.approx(2.5)
-    assert float(terms["auxiliary"]) == pytest.approx(4.0)  # 2 dm off, squared
-    assert float(loss) == pytest.approx(0.5 * 2.5 - 0.1 * 1.0 + 2.0 * 4.0)
+    assert float(terms["auxiliary"]) == pytest.approx(0.25)  # 0.5 dm off, squared
+    assert float(loss) == pytest.approx(0.5 * 2.5 - 0.1 * 1.0 + 2.0 * 0.25)
+
+
+def test_an_object_that_fell_far_does_not_outweigh_the_others():
+    at = torch.tensor([[0.2, 0.0, 0.05], [0.2, 0.0, -4.0]])  # one falls off the table
+    guess = torch.zeros(2, 3, requires_grad=True)
+    agent = judged([0.0, 0.0], value=[0.0, 0.0], target=guess)
+    _, terms = ppo.ppo_loss(
+        agent, batch_of([1.0, -1.0], named_position=at), PPOConfig()
+    )
+    assert float(terms["auxiliary"]) < 20  # the mean of the squares is 267
 
 
 def test_minibatches_cover_every_step_once():

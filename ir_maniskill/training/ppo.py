@@ -100,8 +100,11 @@ def ppo_loss(
     loss = terms["policy"] + config.value_weight * terms["value"]
     loss = loss - config.entropy_weight * terms["entropy"]
     if now.named_position is not None:
-        error = (now.named_position - batch.state["named_position"]) / DECIMETER
-        terms["auxiliary"] = error.square().mean()
+        guess, truth = now.named_position, batch.state["named_position"]
+        # The square up to 1 dm: objects that fall off the table are meters away.
+        terms["auxiliary"] = 2 * functional.huber_loss(
+            guess / DECIMETER, truth / DECIMETER
+        )
         loss = loss + agent.config.auxiliary_weight * terms["auxiliary"]
     terms["kl"] = (ratio - 1 - log_ratio).mean()  # low-variance estimate, never < 0
     terms["clipped"] = ((ratio - 1).abs() > config.clip).float().mean()
