@@ -12,6 +12,7 @@ from torch.nn.functional import one_hot
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.reward_generator import (
+    PUSH_LIMIT,
     DenseWeights,
     FingerCount,
     count_fingers,
@@ -78,7 +79,7 @@ def test_dense_reward_adds_reaching_and_takes_wrong_touches() -> None:
     count = FingerCount(torch.tensor([0, 0, 1, 1]), torch.tensor([0, 2, 0, 0]))
     distance = torch.tensor([[0.1, 0.3], [0.3, 0.0], [0.0, 0.0], [0.0, 0.0]])
     wrong_once = torch.tensor([False, True, False, True])
-    reward = dense_reward(LINE, count, distance, wrong_once, weights)
+    reward = dense_reward(LINE, count, distance, torch.zeros(4), wrong_once, weights)
     at_scale = 0.5 * (1 - 0.7615942)
     assert reward.tolist() == pytest.approx([at_scale, 0.5 - 0.3, 1.5, 0.5 + 0.2])
 
@@ -87,10 +88,19 @@ def test_where_each_finger_counts_all_are_drawn_to_the_named_object() -> None:
     weights = DenseWeights(reach=0.0, gather=4.0, gather_scale=0.05)
     count = FingerCount(torch.tensor([0]), torch.tensor([0]))
     distance = torch.tensor([[0.0, 0.05, 0.5, 0.5]])
-    fresh = torch.tensor([False])
-    drawn = dense_reward(TRIANGLE, count, distance, fresh, weights)
+    rest = (torch.zeros(1), torch.tensor([False]), weights)
+    drawn = dense_reward(TRIANGLE, count, distance, *rest)
     assert drawn.item() == pytest.approx(1.0 + (1 - 0.7615942), abs=1e-4)
-    assert dense_reward(LINE, count, distance, fresh, weights).item() == 0
+    assert dense_reward(LINE, count, distance, *rest).item() == 0
+
+
+def test_pushing_the_named_object_costs_by_its_speed_up_to_a_limit() -> None:
+    weights = DenseWeights(reach=0.0, push=2.0)
+    count = FingerCount(torch.tensor([1, 1, 1]), torch.tensor([0, 0, 0]))
+    speed = torch.tensor([0.0, 0.1, 5.0])
+    rest = (torch.zeros(3, dtype=torch.bool), weights)
+    reward = dense_reward(LINE, count, torch.zeros(3, 2), speed, *rest)
+    assert reward.tolist() == pytest.approx([1.0, 0.8, 0.4])
 
 
 def test_highest_reward_bounds_the_dense_one() -> None:
@@ -101,6 +111,7 @@ def test_highest_reward_bounds_the_dense_one() -> None:
             experiment,
             all_fingers,
             torch.zeros(1, 6),
+            torch.zeros(1),
             torch.zeros(1, dtype=torch.bool),
             weights,
         )
@@ -113,6 +124,10 @@ def test_a_penalty_in_the_line_is_a_field_of_the_experiment() -> None:
     assert sparse_reward(stern, count).item() == pytest.approx(0.0)
 
 
+WEIGHTS = DenseWeights(push=2.0)
+"""Weights of which all count."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Scene:
     """What a step of N envs may look like."""
@@ -120,13 +135,14 @@ class Scene:
     contact: torch.Tensor  # [N, F, C]
     named: torch.Tensor  # [N, C]
     distance: torch.Tensor  # [N, F] [m]
+    speed: torch.Tensor  # [N] [m/s]
     wrong_once: torch.Tensor  # [N]
 
     def reward(self, experiment: catalog.Experiment, **changes: object) -> torch.Tensor:
         """Return the dense reward, with some of this changed."""
         scene = dataclasses.replace(self, **changes)
         count = count_fingers(scene.contact, scene.named)
-        rest = (scene.distance, scene.wrong_once, DenseWeights())
+        rest = (scene.distance, scene.speed, scene.wrong_once, WEIGHTS)
         return dense_reward(experiment, count, *rest)
 
 
@@ -140,6 +156,7 @@ def scenes(draw: st.DrawFn) -> Scene:
         torch.rand(n, 6, c, generator=generator) < crowd,
         one_hot(torch.randint(c, (n,), generator=generator), c).bool(),
         torch.rand(n, 6, generator=generator),
+        torch.rand(n, generator=generator),
         torch.rand(n, generator=generator) < 0.5,
     )
 
@@ -155,13 +172,11 @@ experiments = st.builds(
 def test_rewards_stay_within_their_bounds(
     scene: Scene, experiment: catalog.Experiment
 ) -> None:
-    dense, most = (
-        scene.reward(experiment),
-        highest_reward(experiment, 6, DenseWeights()),
-    )
+    dense, most = scene.reward(experiment), highest_reward(experiment, 6, WEIGHTS)
     assert dense.isfinite().all()
     assert (dense <= most + 1e-6).all()
-    assert (dense >= -6 * experiment.wrong_penalty - DenseWeights().wrong - 1e-5).all()
+    prices = 6 * experiment.wrong_penalty + WEIGHTS.wrong + WEIGHTS.push * PUSH_LIMIT
+    assert (dense >= -prices - 1e-5).all()
 
 
 @given(scenes(), experiments, st.randoms())
@@ -174,6 +189,7 @@ def test_rewards_do_not_depend_on_how_envs_fingers_and_objects_are_numbered(
         scene.contact[rows][:, fingers][:, :, things],
         scene.named[rows][:, things],
         scene.distance[rows][:, fingers],
+        scene.speed[rows],
         scene.wrong_once[rows],
     )
     expected = scene.reward(experiment)[rows]
@@ -181,11 +197,12 @@ def test_rewards_do_not_depend_on_how_envs_fingers_and_objects_are_numbered(
 
 
 @given(scenes(), experiments, st.floats(0, 1))
-def test_coming_nearer_and_sparing_the_others_never_costs(
+def test_coming_nearer_holding_still_and_sparing_the_others_never_costs(
     scene: Scene, experiment: catalog.Experiment, share: float
 ) -> None:
     reward = scene.reward(experiment)
     assert (scene.reward(experiment, distance=share * scene.distance) >= reward).all()
+    assert (scene.reward(experiment, speed=share * scene.speed) >= reward).all()
     spared = torch.zeros_like(scene.wrong_once)
     assert (scene.reward(experiment, wrong_once=spared) >= reward).all()
     alone = scene.contact & scene.named[:, None]
@@ -208,10 +225,10 @@ def test_weights_that_cannot_work_are_refused(name: str, value: float) -> None:
         DenseWeights(**{name: value})
 
 
-def test_the_price_of_other_objects_grows_from_nothing() -> None:
-    weights = DenseWeights(wrong=0.4, spoiled=0.2)
+def test_prices_grow_from_nothing() -> None:
+    weights = DenseWeights(wrong=0.4, push=3.0, spoiled=0.2)
     free, half = weights.at_price(0.0), weights.at_price(0.5)
-    assert (free.wrong, free.spoiled) == (0.0, 1.0)
-    assert (half.wrong, half.spoiled) == pytest.approx((0.2, 0.6))
+    assert (free.wrong, free.push, free.spoiled) == (0.0, 0.0, 1.0)
+    assert (half.wrong, half.push, half.spoiled) == pytest.approx((0.2, 1.5, 0.6))
     assert (half.reach, half.gather) == (weights.reach, weights.gather)
     assert weights.at_price(1.0) == weights

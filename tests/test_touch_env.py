@@ -1,6 +1,7 @@
 """What every task must do, and what a touch is."""
 
 import dataclasses
+import math
 import os
 import subprocess
 import sys
@@ -235,7 +236,7 @@ def hold(env: gym.Env, steps: int = 12, **joints: float) -> tuple[dict, float, d
     return obs, reward.item(), info
 
 
-RED, GREEN = 1, 2
+BLUE, RED, GREEN = 0, 1, 2
 PRESS = {"LShoulderPitch": 0.10, "LShoulderRoll": -0.1}
 
 
@@ -312,6 +313,27 @@ def test_dense_reward_grows_as_the_hand_comes_near() -> None:
     near = hold(env)[1]
     on_it = hold(env, **PRESS)[1]
     assert 0 <= far < near < on_it <= 1
+    env.close()
+
+
+def test_the_named_object_costs_by_its_own_speed() -> None:
+    env = gym.make(
+        "NaoTouchCubeTriangle-v1",
+        obs_mode="none",
+        reward_mode="dense",
+        render_backend="none",
+        dense_weights={"push": 2.0},
+    ).unwrapped
+    env.reset(seed=0, options={"instruction": RED})
+
+    def reward() -> float:
+        return env.compute_dense_reward({}, None, env.evaluate()).item()
+
+    still = reward()
+    env.objects[BLUE].set_linear_velocity(torch.tensor([[0.1, 0.0, 0.0]]))
+    assert reward() == pytest.approx(still, abs=1e-6)
+    env.objects[RED].set_linear_velocity(torch.tensor([[0.1, 0.1, 0.1]]))
+    assert reward() == pytest.approx(still - 2.0 * math.sqrt(0.03), abs=1e-6)
     env.close()
 
 

@@ -1,4 +1,4 @@
-"""Where bodies are, read at once: making a ManiSkill `Pose` for each is slow.
+"""Where bodies are and how fast, read at once: a ManiSkill `Pose` for each is slow.
 
 Legend: N envs, B bodies.
 """
@@ -23,3 +23,15 @@ def positions(bodies: Sequence[Actor | Link]) -> Tensor:
         return torch.stack([body.pose.p for body in bodies], dim=1)
     each = [[part.entity_pose.p for part in body._bodies] for body in bodies]
     return torch.from_numpy(np.array(each, dtype=np.float32)).transpose(0, 1)
+
+
+def speeds(bodies: Sequence[Actor]) -> Tensor:
+    """Return how fast the bodies' centers move [N, B] [m/s].
+
+    Args:
+        bodies: Any that move, of one scene.
+    """
+    if bodies[0].scene.gpu_sim_enabled:
+        return torch.stack([body.linear_velocity for body in bodies], dim=1).norm(dim=2)
+    each = [[part.linear_velocity for part in body._bodies] for body in bodies]
+    return torch.from_numpy(np.linalg.norm(each, axis=2).astype(np.float32).T)

@@ -56,6 +56,10 @@ def sparse_reward(experiment: Experiment, count: FingerCount) -> Tensor:
     return right.float() - experiment.wrong_penalty * count.wrong
 
 
+PUSH_LIMIT = 0.3
+"""Speed from which on a moving object costs no more [m/s]."""
+
+
 @dataclass(frozen=True)
 class DenseWeights:
     """Weights of the dense reward, which is ours and not the paper's."""
@@ -71,14 +75,18 @@ class DenseWeights:
     """Distance at which a finger's part of `gather` has fallen to a quarter [m]."""
     wrong: float = 0.5
     """Taken while another object is touched by any finger."""
+    push: float = 0.0
+    """Taken for each m/s at which the named object moves, counted up to `PUSH_LIMIT`:
+    what makes holding it better than sweeping it along."""
     spoiled: float = 0.25
     """Share of touch and `gather` that is left once another object has been touched
     in the episode: what makes touching only the named object worth learning."""
 
     def at_price(self, share: float) -> DenseWeights:
-        """Return the weights with this share of the price of other objects, 0 to 1."""
+        """Return the weights with a share, 0 to 1, of `wrong`, `push` and `spoiled`."""
         spoiled = self.spoiled + (1 - share) * (1 - self.spoiled)
-        return replace(self, wrong=share * self.wrong, spoiled=spoiled)
+        wrong, push = share * self.wrong, share * self.push
+        return replace(self, wrong=wrong, push=push, spoiled=spoiled)
 
     def __post_init__(self) -> None:
         """Check the fields.
@@ -101,6 +109,7 @@ def dense_reward(
     experiment: Experiment,
     count: FingerCount,
     distance: Tensor,
+    speed: Tensor,
     wrong_once: Tensor,
     weights: DenseWeights,
 ) -> Tensor:
@@ -110,6 +119,7 @@ def dense_reward(
         experiment: Whose reward to shape.
         count: Fingers on the named and on other objects.
         distance: From each finger to the named object's center [N, F] [m].
+        speed: Of the named object [N] [m/s].
         wrong_once: Whether another object has been touched so far [N] bool.
         weights: How much each term counts.
     """
@@ -121,7 +131,9 @@ def dense_reward(
     if experiment.reward == "per_finger":
         near = 1 - torch.tanh(distance / weights.gather_scale)  # [N, F]
         reach = reach + kept * weights.gather * near.mean(dim=1)
-    return touch + reach - weights.wrong * count.wrong.clamp(max=1)
+    price = weights.wrong * count.wrong.clamp(max=1)
+    price = price + weights.push * speed.clamp(max=PUSH_LIMIT)
+    return touch + reach - price
 
 
 def highest_reward(

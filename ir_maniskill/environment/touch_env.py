@@ -22,7 +22,7 @@ from torch import Tensor
 from ir_maniskill import experiment as catalog
 from ir_maniskill.doctor import require_vulkan
 from ir_maniskill.environment import reward_generator, table_scene
-from ir_maniskill.environment.bodies import positions
+from ir_maniskill.environment.bodies import positions, speeds
 from ir_maniskill.environment.instructional_set import InstructionalSet
 from ir_maniskill.environment.reward_generator import DenseWeights, FingerCount
 from ir_maniskill.environment.robot.nao import Nao
@@ -416,6 +416,7 @@ class TouchEnv(BaseEnv):
             self.experiment,
             _count(info),
             distance,
+            speeds(self.objects)[rows, self.target_index],
             info["wrong_once"],
             self.dense_weights,
         )

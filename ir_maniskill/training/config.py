@@ -201,8 +201,9 @@ class TrainConfig:
     dense_weights: DenseWeights = field(default_factory=DenseWeights)
     """What counts how much in the dense reward."""
     lenient_steps: int = 0
-    """Steps over which the price of touching other objects (`dense_weights.wrong` and
-    `spoiled`) grows from nothing to what it is: first to touch, then to touch alone."""
+    """Steps over which the prices of touching other objects (`dense_weights.wrong` and
+    `spoiled`) and of pushing the named one (`push`) grow from nothing to what they are:
+    first to touch, then to touch alone."""
     shader_pack: str | None = "unlit"
     """Shader pack of the cameras: "unlit" paints base colors and is by far the
     cheapest, "minimal" and "default" are lit; None: the task's own."""
@@ -302,6 +303,8 @@ CONFIGS: dict[str, TrainConfig] = {
     "posture": TrainConfig(
         total_steps=250_000,
         eval_episodes=90,
+        dense_weights=DenseWeights(push=6.0),
+        lenient_steps=80_000,
         agent=AgentConfig(posture_gain=1.0, std=1.0),
         ppo=PPOConfig(gamma=0.9),
     ),
@@ -344,6 +347,7 @@ tuned for tasks where each finger counts."""
 
 LATER: dict[str, dict[str, object]] = {
     "AgentConfig": {"posture_gain": 0.0},
+    "DenseWeights": {"push": 0.0},
     "TrainConfig": {"lenient_steps": 0},
 }
 """Fields that older files lack, by class, with the values that those files meant."""
