@@ -186,8 +186,7 @@ def test_value_entropy_and_auxiliary_losses_by_hand():
 
 def test_an_object_that_fell_far_does_not_outweigh_the_others():
     at = torch.tensor([[0.2, 0.0, 0.05], [0.2, 0.0, -4.0]])  # one falls off the table
-    guess = torch.zeros(2, 3, requires_grad=True)
-    agent = judged([0.0, 0.0], value=[0.0, 0.0], target=guess)
+    agent = judged([0.0, 0.0], value=[0.0, 0.0], target=torch.zeros(2, 3))
     _, terms = ppo.ppo_loss(
         agent, batch_of([1.0, -1.0], named_position=at), PPOConfig()
     )
