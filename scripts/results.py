@@ -112,18 +112,19 @@ class Run:
     def changes(self) -> list[str]:
         """Fields in which it differs from that preset, and their values."""
         changes = sorted(self._changes(self.preset).items())
-        idle = self._idle()
-        return [f"{key} {_plain(value)}" for key, value in changes if key not in idle]
+        return [f"{key} {_plain(value)}" for key, value in changes]
 
     def _idle(self) -> set[str]:
         """Return weights of the dense reward that this run did not feel."""
         weights = self.config["dense_weights"]
+        binary = catalog.get(self.task).reward == "binary"
         if self.config["reward_mode"] == "sparse":
             idle = set(weights)
-        elif catalog.get(self.task).reward == "binary":
+        elif binary and not weights["each_finger"]:
             idle = {"gather", "gather_scale"}
         else:
             idle = set() if weights["gather"] else {"gather_scale"}
+        idle |= set() if binary else {"each_finger"}
         return {f"dense_weights.{name}" for name in idle}
 
     @property
@@ -142,8 +143,8 @@ class Run:
 
     def _changes(self, preset: str, untold: Sequence[str] = UNTOLD) -> dict[str, Any]:
         theirs = _flat(asdict(CONFIGS[preset]), untold)
-        mine = _flat(self.config, untold).items()
-        return {key: value for key, value in mine if value != theirs.get(key)}
+        mine, idle = _flat(self.config, untold).items(), self._idle()
+        return {k: v for k, v in mine if k not in idle and v != theirs.get(k)}
 
     def steps_to(self, column: str, level: float) -> int | None:
         """Return after how many steps an evaluation first reached a level."""

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from itertools import product
 from random import Random
 
 import pytest
@@ -94,6 +95,17 @@ def test_where_each_finger_counts_all_are_drawn_to_the_named_object() -> None:
     assert dense_reward(LINE, count, distance, *rest).item() == 0
 
 
+def test_each_finger_can_count_in_the_line_too() -> None:
+    count = FingerCount(torch.tensor([2]), torch.tensor([0]))
+    rest = (torch.full((1, 6), 0.05), torch.zeros(1), torch.tensor([False]))
+    weights = DenseWeights(each_finger=True)
+    line = dense_reward(LINE, count, *rest, weights)
+    free = dataclasses.replace(TRIANGLE, wrong_penalty=0.0)
+    assert line.item() == dense_reward(free, count, *rest, DenseWeights()).item()
+    assert line.item() > 1 + dense_reward(LINE, count, *rest, DenseWeights()).item()
+    assert sparse_reward(LINE, count).item() == 1  # that of evaluations stays
+
+
 def test_pushing_the_named_object_costs_by_its_speed_up_to_a_limit() -> None:
     weights = DenseWeights(reach=0.0, push=2.0)
     count = FingerCount(torch.tensor([1, 1, 1]), torch.tensor([0, 0, 0]))
@@ -104,9 +116,9 @@ def test_pushing_the_named_object_costs_by_its_speed_up_to_a_limit() -> None:
 
 
 def test_highest_reward_bounds_the_dense_one() -> None:
-    weights = DenseWeights()
     all_fingers = FingerCount(torch.tensor([6]), torch.tensor([0]))
-    for experiment in (LINE, TRIANGLE):
+    for experiment, each_finger in product((LINE, TRIANGLE), (False, True)):
+        weights = DenseWeights(each_finger=each_finger)
         best = dense_reward(
             experiment,
             all_fingers,

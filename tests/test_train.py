@@ -88,9 +88,12 @@ def test_training_learns_the_toy_task_and_stops_when_told(tmp_path):
     assert metadata["evaluation"] == report
 
 
-@pytest.mark.parametrize(("reward", "best"), [("binary", 1), ("per_finger", 2)])
+@pytest.mark.parametrize(
+    ("reward", "each_finger", "best"),
+    [("binary", False, 1), ("binary", True, 2), ("per_finger", False, 2)],
+)
 def test_the_best_policy_holds_longest_or_with_the_most_fingers(
-    tmp_path, monkeypatch, reward, best
+    tmp_path, monkeypatch, reward, each_finger, best
 ):
     rates = {"success": Rate(4, 4), "exclusive": Rate(4, 4)}
     scores = [
@@ -104,8 +107,9 @@ def test_the_best_policy_holds_longest_or_with_the_most_fingers(
     monkeypatch.setattr(training, "evaluate_policy", lambda *_, **__: next(reports))
     envs = ToyVectorEnv()
     envs.experiment.reward = reward
-    steps = {"total_steps": 3 * UPDATE, "eval_interval": UPDATE}
-    path = train(toy_config(tmp_path, **steps), envs=envs)
+    config = toy_config(tmp_path, total_steps=3 * UPDATE, eval_interval=UPDATE)
+    weights = DenseWeights(each_finger=each_finger)
+    path = train(dataclasses.replace(config, dense_weights=weights), envs=envs)
     _, _, metadata = checkpoint.load_policy(path)
     assert metadata["steps"] == best * UPDATE
 

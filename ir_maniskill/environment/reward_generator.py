@@ -50,9 +50,13 @@ def sparse_reward(experiment: Experiment, count: FingerCount) -> Tensor:
     "per_finger" (experiment III): 1 for each such finger. Both take
     `wrong_penalty` for each finger on another object (0.1 in experiment III).
     """
-    right = count.right
-    if experiment.reward == "binary":
-        right = right.clamp(max=1)
+    return _touch_reward(experiment, count, experiment.reward == "per_finger")
+
+
+def _touch_reward(
+    experiment: Experiment, count: FingerCount, each_finger: bool
+) -> Tensor:
+    right = count.right if each_finger else count.right.clamp(max=1)
     return right.float() - experiment.wrong_penalty * count.wrong
 
 
@@ -68,6 +72,9 @@ class DenseWeights:
     """Reward of bringing a hand to the named object, at most."""
     reach_scale: float = 0.1
     """Distance at which `reach` has fallen to a quarter, about [m]."""
+    each_finger: bool = False
+    """Whether each finger on the named object counts in all experiments, also where
+    the paper's reward is for touching it at all (I, II)."""
     gather: float = 4.0
     """Reward of bringing all fingers to the named object, at most; only where each
     finger counts."""
@@ -81,6 +88,10 @@ class DenseWeights:
     spoiled: float = 0.25
     """Share of touch and `gather` that is left once another object has been touched
     in the episode: what makes touching only the named object worth learning."""
+
+    def counts_each_finger(self, experiment: Experiment) -> bool:
+        """Whether each finger on the named object adds to the reward."""
+        return self.each_finger or experiment.reward == "per_finger"
 
     def at_price(self, share: float) -> DenseWeights:
         """Return the weights with a share, 0 to 1, of `wrong`, `push` and `spoiled`."""
@@ -115,6 +126,8 @@ def dense_reward(
 ) -> Tensor:
     """Return the sparse reward shaped toward touching the named object alone [N].
 
+    With `weights.each_finger` it is that of experiment III that is shaped.
+
     Args:
         experiment: Whose reward to shape.
         count: Fingers on the named and on other objects.
@@ -124,11 +137,12 @@ def dense_reward(
         weights: How much each term counts.
     """
     kept = torch.where(wrong_once, weights.spoiled, 1.0)  # [N]
-    touch = sparse_reward(experiment, count)
+    each_finger = weights.counts_each_finger(experiment)
+    touch = _touch_reward(experiment, count, each_finger)
     touch = torch.where(touch > 0, kept * touch, touch)
     nearest = distance.min(dim=1).values  # [N]
     reach = weights.reach * (1 - torch.tanh(nearest / weights.reach_scale))
-    if experiment.reward == "per_finger":
+    if each_finger:
         near = 1 - torch.tanh(distance / weights.gather_scale)  # [N, F]
         reach = reach + kept * weights.gather * near.mean(dim=1)
     price = weights.wrong * count.wrong.clamp(max=1)
@@ -140,6 +154,6 @@ def highest_reward(
     experiment: Experiment, fingers: int, weights: DenseWeights
 ) -> float:
     """Return the largest dense reward that one step can give."""
-    if experiment.reward == "binary":
-        return 1.0 + weights.reach
-    return fingers + weights.reach + weights.gather
+    if weights.counts_each_finger(experiment):
+        return fingers + weights.reach + weights.gather
+    return 1.0 + weights.reach

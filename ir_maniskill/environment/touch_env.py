@@ -71,7 +71,7 @@ class TouchEnv(BaseEnv):
         experiment: str | Experiment,
         robot_uids: str | type[Robot] = Nao.uid,
         render_backend: str | None = "auto",
-        dense_weights: dict[str, float] | None = None,
+        dense_weights: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
         """Build the env.

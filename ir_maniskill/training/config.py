@@ -303,7 +303,7 @@ CONFIGS: dict[str, TrainConfig] = {
     "posture": TrainConfig(
         total_steps=250_000,
         eval_episodes=90,
-        dense_weights=DenseWeights(push=6.0),
+        dense_weights=DenseWeights(each_finger=True, push=6.0),
         lenient_steps=80_000,
         agent=AgentConfig(posture_gain=1.0, std=1.0),
         ppo=PPOConfig(gamma=0.9),
@@ -347,7 +347,7 @@ tuned for tasks where each finger counts."""
 
 LATER: dict[str, dict[str, object]] = {
     "AgentConfig": {"posture_gain": 0.0},
-    "DenseWeights": {"push": 0.0},
+    "DenseWeights": {"each_finger": False, "push": 0.0},
     "TrainConfig": {"lenient_steps": 0},
 }
 """Fields that older files lack, by class, with the values that those files meant."""

@@ -249,7 +249,8 @@ class Trainer:
         report = self._report(self.agent, self.config.eval_episodes)
         figures = _figures(report)
         held = figures["eval/touching"]
-        if self.envs.experiment.reward == "per_finger":
+        weights = self.config.dense_weights
+        if weights.counts_each_finger(self.envs.experiment):
             held = figures["eval/right_fingers"] / self.state["touch"].shape[2]
         score = figures["eval/worst"] + figures["eval/exclusive"] + held
         if score > self.best_score:
