@@ -114,8 +114,9 @@ class Run:
         changes = sorted(self._changes(self.preset).items())
         return [f"{key} {_plain(value)}" for key, value in changes]
 
-    def _idle(self) -> set[str]:
-        """Return weights of the dense reward that this run did not feel."""
+    @property
+    def idle(self) -> set[str]:
+        """Weights of the dense reward that this run did not feel."""
         weights = self.config["dense_weights"]
         binary = catalog.get(self.task).reward == "binary"
         if self.config["reward_mode"] == "sparse":
@@ -143,7 +144,7 @@ class Run:
 
     def _changes(self, preset: str, untold: Sequence[str] = UNTOLD) -> dict[str, Any]:
         theirs = _flat(asdict(CONFIGS[preset]), untold)
-        mine, idle = _flat(self.config, untold).items(), self._idle()
+        mine, idle = _flat(self.config, untold).items(), self.idle
         return {k: v for k, v in mine if k not in idle and v != theirs.get(k)}
 
     def steps_to(self, column: str, level: float) -> int | None:
