@@ -58,7 +58,7 @@ class Train:
 
     config: Annotated[TrainOptions, arg(name="")]
     preset: Literal["default", "posture", "paper"] = "default"
-    """Which numbers to start from: ours, ours where each finger counts, the paper's."""
+    """Which numbers to start from: ours to touch, ours to hold, the paper's."""
     resume: bool = False
     """Go on from the last checkpoint of the folder, if there is one."""
 

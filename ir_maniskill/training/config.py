@@ -341,8 +341,8 @@ CONFIGS: dict[str, TrainConfig] = {
         ),
     ),
 }
-"""The named configurations: "paper" as published, "default" as tuned, "posture" as
-tuned for tasks where each finger counts."""
+"""The named configurations: "paper" as published, "default" as tuned to touch,
+"posture" as tuned to hold with many fingers."""
 
 
 LATER: dict[str, dict[str, object]] = {
