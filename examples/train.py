@@ -37,10 +37,12 @@ def configure(
     experiment: str, preset: str, steps: int | None, out: str | None
 ) -> TrainConfig:
     """Return the preset's configuration for an experiment."""
+    config, steps = CONFIGS[preset], steps or STEPS[preset][experiment]
     return replace(
-        CONFIGS[preset],
+        config,
         env_id=TASKS[experiment],
-        total_steps=steps or STEPS[preset][experiment],
+        total_steps=steps,
+        lenient_steps=min(config.lenient_steps, steps // 3),  # then at full price
         out=out or f"runs/{experiment}",
     )
 

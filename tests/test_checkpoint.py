@@ -178,6 +178,10 @@ def test_whatever_a_config_says_it_is_a_config_or_refused(path, value):
         (lambda: PPOConfig(gamma=1.1), "gamma: got 1.1, expected 0 to 1"),
         (lambda: PPOConfig(minibatch=1), "minibatch: got 1, expected 2 to 2048"),
         (lambda: TrainConfig(total_steps=0), "total_steps: got 0"),
+        (
+            lambda: dataclasses.replace(CONFIGS["posture"], total_steps=60_000),
+            "lenient_steps: got 80000, expected 0 to 60000, the total_steps",
+        ),
     ],
 )
 def test_values_that_cannot_work_are_refused(make, message):

@@ -84,6 +84,7 @@ def test_train_knows_the_three_experiments_of_the_paper() -> None:
             config = example["configure"](experiment, preset, None, None)
             assert experiment in config.env_id.lower()
             assert config.total_steps == example["STEPS"][preset][experiment]
+            assert config.lenient_steps <= config.total_steps / 3
             assert config.out == f"runs/{experiment}"
 
 

@@ -235,9 +235,9 @@ class TrainConfig:
         positive += "eval_interval eval_episodes checkpoint_interval"
         for name in positive.split():
             _require(getattr(self, name) > 0, name, getattr(self, name), "at least 1")
-        _require(
-            self.lenient_steps >= 0, "lenient_steps", self.lenient_steps, "0 or more"
-        )
+        lenient, total = self.lenient_steps, self.total_steps
+        expected = f"0 to {total}, the total_steps (a third of them, say)"
+        _require(0 <= lenient <= total, "lenient_steps", lenient, expected)
         for name in ("num_workers", "threads"):
             value = getattr(self, name)
             _require(value is None or value > 0, name, value, "at least 1, or None")
