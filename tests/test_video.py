@@ -1,3 +1,4 @@
+import dataclasses
 from pathlib import Path
 
 import imageio.v2 as imageio
@@ -43,6 +44,18 @@ def test_a_frame_has_the_promised_size():
     frame = draw(snapshot())
     assert frame.shape == (720, 1280, 3) and frame.dtype == np.uint8
     assert (frame.shape[1], frame.shape[0]) == SIZE
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(64, 32), (48, 48), (30, 60)])
+def test_the_policys_pictures_are_shown_whole_and_not_stretched(rows, columns):
+    corner = np.full((rows, columns, 3), 200, np.uint8)
+    corner[: rows // 2, : columns // 2] = RIGHT
+    frame = draw(dataclasses.replace(snapshot(), cameras=(corner,)))
+    x, y, width, height = video.PICTURES[0]
+    ys, xs = np.nonzero((frame[y : y + height, x : x + width] == RIGHT).all(axis=-1))
+    assert np.ptp(xs) + 1 == width // 2
+    assert np.ptp(ys) + 1 == pytest.approx(width * rows / columns / 2, abs=1)
+    assert ys.min() + 2 * (np.ptp(ys) + 1) + ys.min() == pytest.approx(height, abs=2)
 
 
 @pytest.mark.parametrize("finger", range(6))

@@ -208,7 +208,7 @@ def draw(snapshot: Snapshot) -> np.ndarray:
     page = _page().copy()
     _paste(page, snapshot.view, VIEW, radius=14)
     for picture, box in zip(snapshot.cameras, PICTURES, strict=False):
-        _paste(page, picture, box, radius=10)
+        _paste(page, picture, _fit(picture, box), radius=10)
     canvas = ImageDraw.Draw(page)
     canvas.text((32, 46), snapshot.instruction, INK, _font(34))
     _label_cameras(canvas, snapshot.cameras)
@@ -241,7 +241,7 @@ def _page() -> Image.Image:
 
 def _label_cameras(canvas: ImageDraw.ImageDraw, pictures: Sequence[np.ndarray]) -> None:
     for camera, picture, box in zip(CAMERAS, pictures, PICTURES, strict=False):
-        x, y, width, _ = box
+        x, y, width, _ = _fit(picture, box)
         name = camera.replace("_", " ").upper()
         canvas.text((x + 1, y - 10), name, FAINT, _font(12), anchor="ls")
         size = "{} x {}".format(*picture.shape)  # height x width
@@ -257,18 +257,23 @@ def _mask(width: int, height: int, radius: int) -> Image.Image:
     return large.resize((width, height), Image.Resampling.LANCZOS)
 
 
+def _fit(array: np.ndarray, box: Box) -> Box:
+    """Return the largest box of the picture's shape in the middle of a box."""
+    x, y, width, height = box
+    rows, columns = array.shape[:2]
+    scale = min(width / columns, height / rows)
+    wide, high = round(columns * scale), round(rows * scale)
+    return x + (width - wide) // 2, y + (height - high) // 2, wide, high
+
+
 def _paste(page: Image.Image, array: np.ndarray, box: Box, radius: int) -> None:
-    """Paste a picture into a box, cropped to the box's shape."""
+    """Paste a picture into a box of its shape."""
     x, y, width, height = box
     picture = Image.fromarray(np.ascontiguousarray(array))
     if picture.size != (width, height):
-        scale = max(width / picture.width, height / picture.height)
-        small = scale > 1  # what a policy sees stays as coarse as it is
+        small = picture.width < width  # what a policy sees stays as coarse as it is
         method = Image.Resampling.NEAREST if small else Image.Resampling.LANCZOS
-        size = (round(picture.width * scale), round(picture.height * scale))
-        picture = picture.resize(size, method)
-        left, top = (size[0] - width) // 2, (size[1] - height) // 2
-        picture = picture.crop((left, top, left + width, top + height))
+        picture = picture.resize((width, height), method)
     page.paste(picture, (x, y), _mask(width, height, radius))
 
 
