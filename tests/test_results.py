@@ -184,13 +184,32 @@ def test_presets_are_compared_by_the_steps_to_the_same_levels():
         make_run(0, "paper", (0, 0, 3.2)),
         make_run(0, "paper", (0, 3.2), camera_width=16),
     )
-    groups = results.grouped([make_run(0), make_run(1, fingers=(3.1, 0)), paper, blind])
+    ours = [make_run(0), make_run(1, fingers=(3.1, 0))]
+    groups = results.grouped([*ours, paper, blind, changed(2, film=False)])
     text = results.paper_table(groups)
-    assert cells(text, 2)[2:] == ["2 k, 1 k", "`paper`", "3 k", "2 k"]
-    assert cells(text, 0)[2:5] == ["2 k, 2 k", "`paper`", "2 k"]
-    assert cells(text, 1)[2] == cells(text, 1)[4] == "never"
-    assert cells(text, 5)[3:5] == ["`paper`, camera_width 16", "2 k"]
+    assert cells(text, 2)[2:] == [
+        "`default`",
+        "2 k, 1 k",
+        "`paper`",
+        "3 k",
+        "2 k",
+        "1.5",
+    ]
+    assert cells(text, 0)[2:6] == ["`default`", "2 k, 2 k", "`paper`", "2 k"]
+    assert cells(text, 1)[3] == cells(text, 1)[5] == "never"
+    assert cells(text, 1)[-1] == ""
+    assert cells(text, 5)[4:6] == ["`paper`, camera_width 16", "2 k"]
+    assert len(text.splitlines()) == 2 + 2 * 3
     assert results.rivals(groups[:1]) == results.rivals(groups[1:]) == {}
+
+
+def test_where_the_papers_preset_never_gets_there_its_steps_are_a_bound():
+    groups = results.grouped([make_run(0), make_run(0, "paper", (0, 0, 0, 0))])
+    assert cells(results.paper_table(groups), 2)[5:] == [
+        "never",
+        "2 k",
+        "more than 1.0",
+    ]
 
 
 def test_a_policy_is_told_every_sentence_in_the_same_scene():
