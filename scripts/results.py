@@ -541,13 +541,13 @@ def paper_table(groups: Sequence[Group]) -> str:
 
 def _sooner(ours: Group, theirs: Group, column: str, level: float) -> str:
     """Return how many times sooner the slowest of ours is than the first of theirs."""
-    slowest = [run.steps_to(column, level) for run in ours.runs]
-    first = [n for run in theirs.runs if (n := run.steps_to(column, level))]
-    if not all(slowest):
+    here = [n for run in ours.runs if (n := run.steps_to(column, level))]
+    there = [n for run in theirs.runs if (n := run.steps_to(column, level))]
+    if len(here) < len(ours.runs):
         return ""
-    bound = "" if first else "more than "
-    goal = min(first or [run.steps for run in theirs.runs])
-    return f"{bound}{goal / max(filter(None, slowest)):.1f}"
+    bound = "" if there else "more than "
+    first = min(there or [run.steps for run in theirs.runs])
+    return f"{bound}{first / max(here):.1f}"
 
 
 def scenes_table(policies: Mapping[str, Figures]) -> str:

@@ -207,11 +207,13 @@ def draw(snapshot: Snapshot) -> np.ndarray:
     """Draw a frame [720, 1280, 3] uint8."""
     page = _page().copy()
     _paste(page, snapshot.view, VIEW, radius=14)
-    for picture, box in zip(snapshot.cameras, PICTURES, strict=False):
-        _paste(page, picture, _fit(picture, box), radius=10)
+    pictures = zip(snapshot.cameras, PICTURES, strict=False)
+    boxes = [_fit(picture, box) for picture, box in pictures]
+    for picture, box in zip(snapshot.cameras, boxes, strict=False):
+        _paste(page, picture, box, radius=10)
     canvas = ImageDraw.Draw(page)
     canvas.text((32, 46), snapshot.instruction, INK, _font(34))
-    _label_cameras(canvas, snapshot.cameras)
+    _label_cameras(canvas, snapshot.cameras, boxes)
     _draw_timeline(canvas, snapshot)
     _draw_hands(page, snapshot)
     _draw_counters(canvas, snapshot)
@@ -239,9 +241,11 @@ def _page() -> Image.Image:
     return page
 
 
-def _label_cameras(canvas: ImageDraw.ImageDraw, pictures: Sequence[np.ndarray]) -> None:
-    for camera, picture, box in zip(CAMERAS, pictures, PICTURES, strict=False):
-        x, y, width, _ = _fit(picture, box)
+def _label_cameras(
+    canvas: ImageDraw.ImageDraw, pictures: Sequence[np.ndarray], boxes: Sequence[Box]
+) -> None:
+    for camera, picture, box in zip(CAMERAS, pictures, boxes, strict=False):
+        x, y, width, _ = box
         name = camera.replace("_", " ").upper()
         canvas.text((x + 1, y - 10), name, FAINT, _font(12), anchor="ls")
         size = "{} x {}".format(*picture.shape)  # height x width
