@@ -137,6 +137,35 @@ def test_options_are_dealt_out_one_each(envs: ProcessVectorEnv, form: Any) -> No
     assert obs["extra"]["target_object"].argmax(1).tolist() == [1, 1, 1]
 
 
+def test_each_env_is_reset_to_its_own_state(envs: ProcessVectorEnv) -> None:
+    env = gym.make(TASK, **KWARGS).unwrapped
+    sources = []
+    for row in range(3):
+        obs = env.reset(seed=40 + row, options={"instruction": row})[0]
+        sources.append((obs["extra"], env.get_state_dict(), env.get_state()))
+    env.close()
+    told, trees, flat = zip(*sources, strict=True)
+
+    def reset(states: Any) -> dict[str, torch.Tensor]:
+        envs.reset(seed=0)
+        options = {"reset_to_env_states": {"env_states": states}}
+        return envs.reset(options=options)[0]["extra"]
+
+    tree = {
+        kind: {key: torch.cat([t[kind][key] for t in trees]) for key in trees[0][kind]}
+        for kind in trees[0]
+    }
+    for states in (tree, arrays(tree), torch.cat(flat)):
+        obs = reset(states)
+        for row in range(3):
+            for name, value in told[row].items():
+                torch.testing.assert_close(obs[name][row], value[0])
+    for states in (trees[1], flat[1]):  # a single row is for all
+        assert reset(states)["target_object"].argmax(1).tolist() == [1, 1, 1]
+    with pytest.raises(ValueError, match=r"\['env_states'\]: got 2 values, expected 3"):
+        reset(torch.cat(flat[:2]))
+
+
 def test_seeds_may_be_those_of_numpy(flat: ProcessVectorEnv) -> None:
     expected, _ = flat.reset(seed=[4, 5, 6])
     for seed in (4, np.int64(4), np.arange(4, 7), torch.arange(4, 7)):

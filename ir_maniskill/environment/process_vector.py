@@ -219,11 +219,11 @@ class ProcessVectorEnv(VectorEnv):
             seed: Env i gets seed + i, or the i-th of a list; None goes on with each
                 env's own random stream, which begins with 2022 + i.
             options: Passed to the envs; a list, array or tensor of N values is dealt
-                out, one each.
+                out, one each, and so are states of N rows ("reset_to_env_states").
 
         Raises:
-            ValueError: There are not N seeds or values of an option, or the options
-                name some of the envs.
+            ValueError: There are not N seeds, values of an option or rows of a state,
+                or the options name some of the envs.
             WorkerError: A worker refused an option, failed, died or hangs; or it has
                 not answered the last command.
         """
@@ -422,9 +422,22 @@ def _deal(options: dict[str, Any], num_envs: int) -> Iterator[dict[str, Any]]:
 
 
 def _values(what: str, given: Any, num_envs: int) -> list:
-    """Return each env's value of what is given for all or one each."""
+    """Return each env's value of what is given for all or one each.
+
+    Of arrays of more dimensions, also in nested dicts, each gets its row [1, ...].
+    """
+    if isinstance(given, dict):
+        dealt = {
+            name: _values(f"{what}[{name!r}]", value, num_envs)
+            for name, value in given.items()
+        }
+        return [{name: dealt[name][row] for name in dealt} for row in range(num_envs)]
     if isinstance(given, Tensor | np.ndarray):
-        given = given.tolist()
+        given = np.asarray(given)
+        if given.ndim < 2:
+            given = given.tolist()
+        elif len(given) > 1:
+            given = list(given[:, None])
     if not isinstance(given, list | tuple):
         return [given] * num_envs
     if len(given) != num_envs:

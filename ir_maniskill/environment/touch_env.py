@@ -464,6 +464,7 @@ class TouchEnv(BaseEnv):
 
     def set_state(self, state: Tensor, env_idx: Tensor | None = None) -> None:
         """Restore what `get_state` returned: the same, as one flat row per env."""
+        state = common.to_tensor(state, device=self.device)
         tail = len(self.agent.start_qpos) + len(TASK_STATE)
         super().set_state(state[:, :-tail], env_idx)
         target, task = state[:, -tail:].split(
