@@ -22,7 +22,7 @@ from ir_maniskill.agent.agent import Agent
 from ir_maniskill.experiment import Experiment
 from ir_maniskill.training import distributed, plots, video
 from ir_maniskill.training.checkpoint import load_policy, writing
-from ir_maniskill.training.config import CONFIGS, TrainConfig
+from ir_maniskill.training.config import CONFIGS, SimBackend, TrainConfig
 from ir_maniskill.training.evaluate import (
     EVALUATION_SEED,
     evaluate_policy,
@@ -79,6 +79,8 @@ class Evaluate:
     """Seed of the first episode; episode e starts from seed + e."""
     num_envs: int = 8
     """Scenes simulated side by side; on a CPU the result is the same for any number."""
+    sim_backend: SimBackend = "physx_cpu"
+    """Where physics is computed, as for `train`."""
     json: Path | None = None
     """File to write the report to."""
     instruction: str | None = None
@@ -259,7 +261,7 @@ def _evaluate(command: Evaluate) -> int:
         seed=command.seed,
         num_envs=command.num_envs,
         frames=config.frames,
-        env_kwargs=kwargs,
+        env_kwargs={**kwargs, "sim_backend": command.sim_backend},
         instructions=chosen,
         progress=True,
     )

@@ -145,13 +145,25 @@ def test_with_a_posture_gain_targets_go_to_the_posture_and_stay_there():
     sizes = {"std": 0.5, "learn_std": False}
     actor = Actor(10, (20,), ACTIONS, **sizes, posture_gain=0.5)
     posture = torch.linspace(-0.9, 0.9, ACTIONS)
-    actor.mean[-1].bias.data.copy_(0.5 * posture)
+    actor.mean[-1].bias.data.copy_(posture)
     aligned, target = torch.zeros(8, 10), torch.rand(8, ACTIONS)
     target[0] = posture
     assert torch.allclose(actor(aligned, target).mean[0], torch.zeros(1), atol=1e-6)
     for _ in range(100):
         target = target + DELTA * actor(aligned, target).mean.clamp(-1, 1)
     assert torch.allclose(target, posture.expand(8, -1), atol=1e-3)
+
+
+def test_a_gain_that_changes_is_kept_with_the_weights_and_the_posture_stays():
+    made = [
+        Actor(10, (20,), ACTIONS, std=0.5, learn_std=False, posture_gain=1.0,
+              gain_changes=True) for _ in range(2)
+    ]  # fmt: skip
+    aligned, target = torch.randn(8, 10), torch.rand(8, ACTIONS)
+    posture = made[0](aligned, target).mean + target
+    made[0].set_gain(2.0)
+    made[1].load_state_dict(made[0].state_dict())
+    assert torch.allclose(made[1](aligned, target).mean, 2 * (posture - target))
 
 
 def test_the_newest_joint_targets_are_what_the_posture_is_compared_with():

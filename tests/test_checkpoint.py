@@ -175,6 +175,10 @@ def test_whatever_a_config_says_it_is_a_config_or_refused(path, value):
             ),
             "posture_gain: got 1.0, expected 0 where actions do not change",
         ),
+        (
+            lambda: AgentConfig(posture_gain_final=2.0),
+            "posture_gain_final: got 2.0, expected .* beside a posture_gain above 0",
+        ),
         (lambda: PPOConfig(gamma=1.1), "gamma: got 1.1, expected 0 to 1"),
         (lambda: PPOConfig(minibatch=1), "minibatch: got 1, expected 2 to 2048"),
         (lambda: TrainConfig(total_steps=0), "total_steps: got 0"),

@@ -12,7 +12,7 @@ from toy_envs import LENGTH, SENTENCES, ToyVectorEnv, toy_config
 import ir_maniskill
 from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.reward_generator import DenseWeights
-from ir_maniskill.training import checkpoint
+from ir_maniskill.training import checkpoint, distributed
 from ir_maniskill.training import train as training
 from ir_maniskill.training.checkpoint import CheckpointError
 from ir_maniskill.training.config import AgentConfig, ConfigError, TrainConfig
@@ -280,6 +280,28 @@ def test_senses_left_to_the_experiment_decide_what_the_envs_give(tmp_path, monke
     with pytest.raises(AttributeError):  # there are no envs
         train(dataclasses.replace(config, agent=senseless))
     assert made[0]["obs_mode"] == "state_dict"
+
+
+@pytest.mark.parametrize(
+    ("device", "backend", "expected"),
+    [
+        ("cpu", "physx_cpu", ("physx_cpu", None)),
+        ("cuda", "physx_cpu", ("physx_cpu", None)),
+        ("cuda", "physx_cuda", ("physx_cuda", None)),
+        ("cuda:1", "physx_cpu", ("physx_cpu", "sapien_cuda:1")),
+        ("cuda:1", "physx_cuda", ("physx_cuda:1", "sapien_cuda:1")),
+    ],
+)
+def test_physics_is_where_the_config_says_and_drawing_on_the_ranks_gpu(
+    tmp_path, monkeypatch, device, backend, expected
+):
+    made = []
+    monkeypatch.setattr(training, "make_vec", lambda *_, **kwargs: made.append(kwargs))
+    monkeypatch.setattr(distributed, "device", lambda: torch.device(device))
+    config = TrainConfig(out=str(tmp_path), sim_backend=backend)
+    with pytest.raises(AttributeError):  # there are no envs
+        train(config)
+    assert (made[0]["sim_backend"], made[0].get("render_backend")) == expected
 
 
 def test_too_few_episodes_for_the_sentences_are_refused_before_training(tmp_path):

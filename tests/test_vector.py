@@ -330,6 +330,19 @@ def test_workers_end_when_the_parent_is_killed() -> None:
     assert not any(map(alive, workers))
 
 
+@pytest.fixture
+def cuda(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_batch_on_a_gpu_needs_one() -> None:
+    message = "got 'physx_cuda', expected 'physx_cpu': torch sees no CUDA device"
+    with pytest.raises(ValueError, match=message):
+        make_vec(TASK, 3, sim_backend="physx_cuda")
+
+
+@pytest.mark.usefixtures("cuda")
 @pytest.mark.parametrize("backend", ["gpu", "cuda", "cuda:0", "physx_cuda:0"])
 def test_every_name_of_the_gpu_means_the_gpu(
     backend: str, monkeypatch: pytest.MonkeyPatch
@@ -338,6 +351,7 @@ def test_every_name_of_the_gpu_means_the_gpu(
     assert make_vec(TASK, 3, sim_backend=backend) == backend
 
 
+@pytest.mark.usefixtures("cuda")
 def test_a_batch_on_a_gpu_is_seeded_alike(monkeypatch: pytest.MonkeyPatch) -> None:
     resets: list[tuple] = []
 

@@ -26,12 +26,13 @@ def tanh_layers(
 class Actor(nn.Module):
     """pi(a|s): a Gaussian whose mean is read from B_t, whose deviation is not.
 
-    With a `posture_gain` g the mean is g (p - q), where q are the joint targets and
-    g p is what the layers give: as long as that stays, changes of the targets bring
-    them to the posture p and hold them there, whatever noise did to them before.
+    With a `posture_gain` g the mean is g (p - q), where q are the joint targets and p
+    is what the layers give: as long as that stays, changes of the targets bring them
+    to the posture p and hold them there, whatever noise did to them before.
     """
 
     log_std: Tensor
+    posture_gain: float | Tensor
 
     def __init__(
         self,
@@ -42,10 +43,15 @@ class Actor(nn.Module):
         std: float,
         learn_std: bool,
         posture_gain: float = 0.0,
+        gain_changes: bool = False,
     ) -> None:
         """Make the layers; at first they give about 0, the middle of each joint."""
         super().__init__()
-        self.posture_gain = posture_gain
+        self.aims = posture_gain > 0
+        if gain_changes:  # then it belongs to what is learned, and is stored with it
+            self.register_buffer("posture_gain", torch.tensor(posture_gain))
+        else:
+            self.posture_gain = posture_gain
         self.mean = tanh_layers(inputs, hidden, actions, gain=0.01)
         log_std = torch.full((actions,), math.log(std))
         if learn_std:
@@ -61,10 +67,15 @@ class Actor(nn.Module):
             target: The joint targets [N, A] in [-1, 1]; unused without `posture_gain`.
         """
         mean = self.mean(aligned)
-        if self.posture_gain:
-            mean = mean - self.posture_gain * target
+        if self.aims:
+            mean = self.posture_gain * (mean - target)
         std = self.log_std.exp().expand_as(mean)
         return Normal(mean, std, validate_args=False)
+
+    def set_gain(self, gain: float) -> None:
+        """Set a posture gain that changes (a schedule's)."""
+        assert isinstance(self.posture_gain, Tensor), "made with a gain that stays"
+        self.posture_gain.fill_(gain)
 
     def set_std(self, std: float) -> None:
         """Set the deviation of every action (a schedule's, not a learned one)."""

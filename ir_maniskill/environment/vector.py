@@ -42,7 +42,7 @@ def make_vec(
 
     Raises:
         UnknownExperimentError: There is no task of that id.
-        ValueError: A number is out of range, or there is no such backend.
+        ValueError: A number is out of range, or there is no such backend here.
         WorkerError: A worker process failed to start its envs.
     """
     experiment = catalog.get(task_id)
@@ -52,6 +52,11 @@ def make_vec(
     if sim_backend == "auto":
         sim_backend = "physx_cuda" if torch.cuda.is_available() else "physx_cpu"
     if _simulator(sim_backend) == "physx_cuda":
+        if not torch.cuda.is_available():
+            raise ValueError(
+                f"sim_backend: got {sim_backend!r}, expected 'physx_cpu': torch sees "
+                "no CUDA device here"
+            )
         return GpuVectorEnv(task_id, num_envs, sim_backend=sim_backend, **env_kwargs)
     return ProcessVectorEnv(
         experiment,

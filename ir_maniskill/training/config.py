@@ -19,6 +19,7 @@ Vision = Literal["patches", "paper"]
 CriticInput = Literal["asymmetric", "separate", "shared"]
 ControlMode = Literal["pd_joint_target_delta_pos", "pd_joint_pos"]
 RewardMode = Literal["dense", "normalized_dense", "sparse"]
+SimBackend = Literal["physx_cpu", "physx_cuda"]
 StdMode = Literal["annealed", "decayed", "fixed", "learned"]
 
 Config = TypeVar("Config")
@@ -70,6 +71,8 @@ class AgentConfig:
     posture_gain: float = 0.0
     """How strongly mean actions, changes of the joint targets, draw these toward the
     posture that the actor's layers then give; 0: the layers give the action itself."""
+    posture_gain_final: float | None = None
+    """The same at the end, approached by the same amount each step; None: it stays."""
     hidden: tuple[int, ...] = (500, 256, 128)
     """Units of the actor's and the critic's tanh layers."""
     critic: CriticInput = "asymmetric"
@@ -116,6 +119,10 @@ class AgentConfig:
         fits = gain == 0 or (felt and self.sees_target)
         expected = "0 where the actor does not feel its joint targets"
         _require(fits, "posture_gain", gain, expected)
+        final = self.posture_gain_final
+        fits = final is None or (gain > 0 and 0 < final < math.inf)
+        expected = "a finite number above 0 beside a posture_gain above 0, or None"
+        _require(fits, "posture_gain_final", final, expected)
 
 
 @dataclass(frozen=True)
@@ -188,6 +195,9 @@ class TrainConfig:
     """Environment steps, over all envs; rounded up to whole updates."""
     num_envs: int = 16
     """Scenes simulated side by side, over all ranks; must divide `ppo.rollouts`."""
+    sim_backend: SimBackend = "physx_cpu"
+    """Where physics is computed: "physx_cpu" has worker processes, which draw on a GPU
+    if there is one; "physx_cuda" has all envs in one batch on the GPU."""
     num_workers: int | None = None
     """Simulator processes of each rank on the CPU; None: one a core."""
     threads: int | None = None
@@ -241,6 +251,7 @@ class TrainConfig:
         for name in ("num_workers", "threads"):
             value = getattr(self, name)
             _require(value is None or value > 0, name, value, "at least 1, or None")
+        _require_choice("sim_backend", self.sim_backend, SimBackend)
         _require_choice("control_mode", self.control_mode, ControlMode)
         _require_choice("reward_mode", self.reward_mode, RewardMode)
         for name, bits in (("seed", 31), ("eval_seed", 29)):
@@ -346,9 +357,9 @@ CONFIGS: dict[str, TrainConfig] = {
 
 
 LATER: dict[str, dict[str, object]] = {
-    "AgentConfig": {"posture_gain": 0.0},
+    "AgentConfig": {"posture_gain": 0.0, "posture_gain_final": None},
     "DenseWeights": {"each_finger": False, "push": 0.0},
-    "TrainConfig": {"lenient_steps": 0},
+    "TrainConfig": {"lenient_steps": 0, "sim_backend": "physx_cpu"},
 }
 """Fields that older files lack, by class, with the values that those files meant."""
 

@@ -27,7 +27,8 @@ from ir_maniskill.training.rollout import RewardScale, Rollout, collect, to
 from ir_maniskill.training.run_folder import RunFolder
 
 MAY_CHANGE = {
-    *("out", "total_steps", "num_workers", "threads", "stop_at_success"),
+    *("out", "total_steps", "stop_at_success"),
+    *("sim_backend", "num_workers", "threads"),
     *("eval_interval", "eval_episodes", "checkpoint_interval"),
 }
 """Fields of the config that a resumed run may set anew."""
@@ -125,13 +126,15 @@ def _require_fit(config: TrainConfig, envs: VectorEnv) -> None:
 def _make_envs(config: TrainConfig) -> VectorEnv:
     """Make this rank's envs, on its device."""
     device, kwargs = distributed.device(), config.env_kwargs(training=True)
-    if device.index is not None:
+    backend: str = config.sim_backend
+    if device.index is not None:  # of several GPUs, this rank's
         kwargs["render_backend"] = f"sapien_{device}"
+        backend = backend.replace("cuda", str(device))
     return make_vec(
         config.env_id,
         config.num_envs // distributed.size(),
         num_workers=config.num_workers or distributed.cores(),
-        sim_backend=f"physx_{device}",
+        sim_backend=backend,
         **kwargs,
     )
 
@@ -387,9 +390,12 @@ class Trainer:
         return to(self.stack.reset(obs), self.device)
 
     def _anneal(self) -> None:
-        """Let the action noise shrink with the share of the steps made."""
+        """Let noise and posture gain change with the share of the steps made."""
         agent = self.config.agent
         share = min(self.steps / self.config.total_steps, 1.0)
+        gain, final = agent.posture_gain, agent.posture_gain_final
+        if final is not None:
+            self.agent.actor.set_gain(gain + share * (final - gain))
         if agent.std_mode == "annealed":
             self.agent.actor.set_std(agent.std + share * (agent.std_final - agent.std))
         elif agent.std_mode == "decayed":
