@@ -22,7 +22,12 @@ from ir_maniskill.agent.agent import Agent
 from ir_maniskill.experiment import Experiment
 from ir_maniskill.training import distributed, plots, video
 from ir_maniskill.training.checkpoint import load_policy, writing
-from ir_maniskill.training.config import CONFIGS, SimBackend, TrainConfig
+from ir_maniskill.training.config import (
+    CONFIGS,
+    RenderBackend,
+    SimBackend,
+    TrainConfig,
+)
 from ir_maniskill.training.evaluate import (
     EVALUATION_SEED,
     evaluate_policy,
@@ -81,6 +86,8 @@ class Evaluate:
     """Scenes simulated side by side; on a CPU the result is the same for any number."""
     sim_backend: SimBackend = "physx_cpu"
     """Where physics is computed, as for `train`."""
+    render_backend: RenderBackend = "auto"
+    """What draws, as for `train`."""
     json: Path | None = None
     """File to write the report to."""
     instruction: str | None = None
@@ -254,6 +261,8 @@ def _evaluate(command: Evaluate) -> int:
     if command.json is not None:
         _require_writable(command.json)
     kwargs = config.env_kwargs(training=False)
+    kwargs["sim_backend"] = command.sim_backend
+    kwargs["render_backend"] = command.render_backend
     report = evaluate_policy(
         agent.policy,
         task.id,
@@ -261,7 +270,7 @@ def _evaluate(command: Evaluate) -> int:
         seed=command.seed,
         num_envs=command.num_envs,
         frames=config.frames,
-        env_kwargs={**kwargs, "sim_backend": command.sim_backend},
+        env_kwargs=kwargs,
         instructions=chosen,
         progress=True,
     )

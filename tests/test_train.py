@@ -11,6 +11,7 @@ from toy_envs import LENGTH, SENTENCES, ToyVectorEnv, toy_config
 
 import ir_maniskill
 from ir_maniskill import experiment as catalog
+from ir_maniskill.agent.actor import Actor
 from ir_maniskill.environment.reward_generator import DenseWeights
 from ir_maniskill.training import checkpoint, distributed
 from ir_maniskill.training import train as training
@@ -283,25 +284,26 @@ def test_senses_left_to_the_experiment_decide_what_the_envs_give(tmp_path, monke
 
 
 @pytest.mark.parametrize(
-    ("device", "backend", "expected"),
+    ("device", "asked", "expected"),
     [
-        ("cpu", "physx_cpu", ("physx_cpu", None)),
-        ("cuda", "physx_cpu", ("physx_cpu", None)),
-        ("cuda", "physx_cuda", ("physx_cuda", None)),
-        ("cuda:1", "physx_cpu", ("physx_cpu", "sapien_cuda:1")),
-        ("cuda:1", "physx_cuda", ("physx_cuda:1", "sapien_cuda:1")),
+        ("cpu", ("physx_cpu", "auto"), ("physx_cpu", "auto")),
+        ("cuda", ("physx_cpu", "cpu"), ("physx_cpu", "cpu")),
+        ("cuda", ("physx_cuda", "auto"), ("physx_cuda", "auto")),
+        ("cuda:1", ("physx_cpu", "cpu"), ("physx_cpu", "cpu")),
+        ("cuda:1", ("physx_cuda", "auto"), ("physx_cuda:1", "sapien_cuda:1")),
     ],
 )
-def test_physics_is_where_the_config_says_and_drawing_on_the_ranks_gpu(
-    tmp_path, monkeypatch, device, backend, expected
+def test_physics_and_drawing_are_where_the_config_says(
+    tmp_path, monkeypatch, device, asked, expected
 ):
     made = []
     monkeypatch.setattr(training, "make_vec", lambda *_, **kwargs: made.append(kwargs))
     monkeypatch.setattr(distributed, "device", lambda: torch.device(device))
-    config = TrainConfig(out=str(tmp_path), sim_backend=backend)
+    sim, render = asked
+    config = TrainConfig(out=str(tmp_path), sim_backend=sim, render_backend=render)
     with pytest.raises(AttributeError):  # there are no envs
         train(config)
-    assert (made[0]["sim_backend"], made[0].get("render_backend")) == expected
+    assert (made[0]["sim_backend"], made[0]["render_backend"]) == expected
 
 
 def test_too_few_episodes_for_the_sentences_are_refused_before_training(tmp_path):
@@ -410,6 +412,21 @@ def test_the_noise_shrinks_as_steps_are_made(tmp_path, mode, expected):
     run(dataclasses.replace(config, agent=dataclasses.replace(config.agent, **noise)))
     got = [float(row["std"]) for row in rows(tmp_path, "metrics")]
     assert got == pytest.approx(expected, abs=1e-4)
+
+
+def test_the_posture_gain_changes_as_steps_are_made_and_is_kept(tmp_path, monkeypatch):
+    gains, set_gain = [], Actor.set_gain
+    monkeypatch.setattr(
+        Actor,
+        "set_gain",
+        lambda actor, gain: (gains.append(gain), set_gain(actor, gain)),
+    )
+    config = toy_config(tmp_path)
+    changes = {"posture_gain": 1.0, "posture_gain_final": 2.0}
+    run(dataclasses.replace(config, agent=dataclasses.replace(config.agent, **changes)))
+    assert gains == pytest.approx([1, 1.25, 1.5, 1.75])
+    agent, _, _ = checkpoint.load_policy(tmp_path / "best.safetensors")
+    assert float(agent.actor.posture_gain) == 1.75
 
 
 def test_other_objects_get_their_price_as_steps_are_made(tmp_path):

@@ -20,6 +20,7 @@ CriticInput = Literal["asymmetric", "separate", "shared"]
 ControlMode = Literal["pd_joint_target_delta_pos", "pd_joint_pos"]
 RewardMode = Literal["dense", "normalized_dense", "sparse"]
 SimBackend = Literal["physx_cpu", "physx_cuda"]
+RenderBackend = Literal["auto", "cpu"]
 StdMode = Literal["annealed", "decayed", "fixed", "learned"]
 
 Config = TypeVar("Config")
@@ -196,8 +197,10 @@ class TrainConfig:
     num_envs: int = 16
     """Scenes simulated side by side, over all ranks; must divide `ppo.rollouts`."""
     sim_backend: SimBackend = "physx_cpu"
-    """Where physics is computed: "physx_cpu" has worker processes, which draw on a GPU
-    if there is one; "physx_cuda" has all envs in one batch on the GPU."""
+    """Where physics is computed: "physx_cpu" has worker processes on the cores,
+    "physx_cuda" all envs in one batch on the GPU."""
+    render_backend: RenderBackend = "auto"
+    """What draws: "auto" is a GPU if there is one, "cpu" the cores, through Mesa."""
     num_workers: int | None = None
     """Simulator processes of each rank on the CPU; None: one a core."""
     threads: int | None = None
@@ -252,6 +255,7 @@ class TrainConfig:
             value = getattr(self, name)
             _require(value is None or value > 0, name, value, "at least 1, or None")
         _require_choice("sim_backend", self.sim_backend, SimBackend)
+        _require_choice("render_backend", self.render_backend, RenderBackend)
         _require_choice("control_mode", self.control_mode, ControlMode)
         _require_choice("reward_mode", self.reward_mode, RewardMode)
         for name, bits in (("seed", 31), ("eval_seed", 29)):
@@ -359,7 +363,11 @@ CONFIGS: dict[str, TrainConfig] = {
 LATER: dict[str, dict[str, object]] = {
     "AgentConfig": {"posture_gain": 0.0, "posture_gain_final": None},
     "DenseWeights": {"each_finger": False, "push": 0.0},
-    "TrainConfig": {"lenient_steps": 0, "sim_backend": "physx_cpu"},
+    "TrainConfig": {
+        "lenient_steps": 0,
+        "render_backend": "auto",
+        "sim_backend": "physx_cpu",
+    },
 }
 """Fields that older files lack, by class, with the values that those files meant."""
 

@@ -28,7 +28,7 @@ from ir_maniskill.training.run_folder import RunFolder
 
 MAY_CHANGE = {
     *("out", "total_steps", "stop_at_success"),
-    *("sim_backend", "num_workers", "threads"),
+    *("sim_backend", "render_backend", "num_workers", "threads"),
     *("eval_interval", "eval_episodes", "checkpoint_interval"),
 }
 """Fields of the config that a resumed run may set anew."""
@@ -126,15 +126,16 @@ def _require_fit(config: TrainConfig, envs: VectorEnv) -> None:
 def _make_envs(config: TrainConfig) -> VectorEnv:
     """Make this rank's envs, on its device."""
     device, kwargs = distributed.device(), config.env_kwargs(training=True)
-    backend: str = config.sim_backend
+    sim_backend, render_backend = str(config.sim_backend), str(config.render_backend)
     if device.index is not None:  # of several GPUs, this rank's
-        kwargs["render_backend"] = f"sapien_{device}"
-        backend = backend.replace("cuda", str(device))
+        sim_backend = sim_backend.replace("cuda", str(device))
+        render_backend = render_backend.replace("auto", f"sapien_{device}")
     return make_vec(
         config.env_id,
         config.num_envs // distributed.size(),
         num_workers=config.num_workers or distributed.cores(),
-        sim_backend=backend,
+        sim_backend=sim_backend,
+        render_backend=render_backend,
         **kwargs,
     )
 
