@@ -45,7 +45,10 @@ PAPER = {
     "NaoTouchCubeTriangle-v1": 3.1,
 }
 """The paper's mean return, read as right fingers a step; the page says why."""
-UNCOPIED = ("env_id", "out", "num_workers", "threads", "checkpoint_interval")
+UNCOPIED = (
+    *("env_id", "out", "checkpoint_interval"),
+    *("sim_backend", "render_backend", "num_workers", "threads"),
+)
 """Fields of a config that need not be repeated to repeat a run."""
 UNTOLD = (
     *(*UNCOPIED, "seed", "total_steps", "num_envs"),

@@ -25,7 +25,7 @@ def make_vec(
     *,
     num_workers: int | None = None,
     timeout: float = 180.0,
-    sim_backend: str = "auto",
+    sim_backend: str = "physx_cpu",
     **env_kwargs: Any,
 ) -> VectorEnv:
     """Make `num_envs` envs that step together.
@@ -35,9 +35,9 @@ def make_vec(
         num_envs: Number of envs N.
         num_workers: Worker processes on the CPU; None is one per core.
         timeout: How long a worker process may take for one command [s].
-        sim_backend: "physx_cuda" (one process, batched; ":0" behind it names a
-            device), "physx_cpu" (processes), ManiSkill's other names of these, or
-            "auto": CUDA where torch sees a device, else processes.
+        sim_backend: "physx_cpu" (processes), "physx_cuda" (one process, batched; ":0"
+            behind it names a device), ManiSkill's other names of these, or "auto":
+            CUDA where torch sees a device, else processes.
         **env_kwargs: As for `gym.make(task_id)`.
 
     Raises:
