@@ -192,6 +192,26 @@ def test_later_scenes_begin_with_what_was_found_before(stage):
     assert figures["episodes"] == 2
 
 
+@pytest.mark.parametrize(
+    ("goal", "changes", "is_kept"),
+    [
+        ("fingers", {"right_fingers": 2.1}, True),
+        ("fingers", {"right_fingers": 1.9}, False),
+        ("touching", {"right_fingers": 2.1}, False),
+        ("touching", {"touching": 0.96}, True),
+        ("fingers", {"right_fingers": 2.1, "exclusive": 0.5}, False),
+        ("fingers", {"right_fingers": 2.1, "episodes": 4}, False),
+    ],
+)
+def test_of_two_searches_of_the_same_scenes_the_better_one_stays(
+    goal, changes, is_kept
+):
+    new = {"episodes": 2, "exclusive": 1.0, "touching": 0.95, "right_fingers": 2.0}
+    old = {**new, **changes}
+    assert (oracle.better(goal, new, old) is old) == is_kept
+    assert oracle.better(goal, new, None) is new
+
+
 def test_a_recorded_plan_still_does_what_it_did(stage):
     """If this fails, the scenes have changed: run scripts/oracle.py again."""
     record, figures = recorded_plan(), recorded_figures()
