@@ -11,6 +11,7 @@ import time
 import types
 from collections.abc import Iterator
 from multiprocessing.connection import wait
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -257,6 +258,16 @@ def test_a_dead_worker_is_named_and_close_leaves_nothing() -> None:
     assert not any(alive(pid) for pid in victims)
     with pytest.raises(WorkerError, match="closed"):
         envs.reset()
+
+
+def test_a_script_without_a_guard_is_told_to_have_one(tmp_path: Path) -> None:
+    script = tmp_path / "unguarded.py"
+    options = "sim_backend='physx_cpu', obs_mode='state', render_backend='none'"
+    script.write_text(f"import ir_maniskill as ir\nir.make_vec({TASK!r}, 1, {options})")
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True)
+    assert done.returncode == 1
+    last = done.stderr.splitlines()[-1]
+    assert "code 1;" in last and "guard the script's entry with `if __name__" in last
 
 
 def test_a_hanging_worker_is_named_instead_of_waited_for() -> None:

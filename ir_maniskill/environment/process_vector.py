@@ -394,7 +394,9 @@ class ProcessVectorEnv(VectorEnv):
         process.join(1.0)
         return WorkerError(
             f"{self._describe(index)} died with exit code {process.exitcode}; "
-            "a negative one is the signal that killed it (-9: often out of memory)"
+            "a negative one is the signal that killed it (-9: often out of memory); "
+            "with 1 its error stands above, and if that speaks of bootstrapping, guard "
+            'the script\'s entry with `if __name__ == "__main__":`'
         )
 
 
