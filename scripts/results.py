@@ -68,8 +68,9 @@ PAPER_SETTINGS = """\
 The preset `paper` on the same tasks and in the same scenes: after how many steps a
 choosing evaluation first reached the level named, for each seed; *of* says how long the
 paper's preset was trained, *ratio* how many times sooner the slowest of our seeds was.
-With pictures an update takes it some ten minutes on two cores; told all by the
-simulator's state in their place, it should need fewer steps."""
+From pictures (`agent.senses vision`, experiment I's) it was trained on a GPU, since an
+update takes some ten minutes on two cores; the other run is told all by the simulator's
+state in their place."""
 ONE_SETTING = """\
 ## What one setting changes
 
