@@ -1,6 +1,6 @@
 """Ships the best policy of a run with the package: `ship_policy.py runs/NAME`.
 
-Rounds the weights to 16 bits, evaluates the rounded policy on pinned scenes, tells it
+Rounds the weights to few bits, evaluates the rounded policy on pinned scenes, tells it
 all sentences of the task in the same ones, and writes it with its config, figures and
 the commit to `assets/policies/ID.safetensors`.
 """
@@ -12,20 +12,27 @@ import dataclasses
 import json
 import subprocess
 import tempfile
-from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from ir_maniskill import experiment as catalog
+from ir_maniskill.environment.state import State
 from ir_maniskill.training import checkpoint
 from ir_maniskill.training.evaluate import (
     EVALUATION_SEED,
     EvaluationReport,
+    Policy,
     evaluate_policy,
     evaluate_scenes,
 )
 
 FOLDER = Path(__file__).parent.parent / "assets" / "policies"
+
+SEEN_EPISODES = 120
+"""Episodes whose states the rounded policy shall act alike in."""
 
 
 def ship(run: Path, episodes: int, scenes: int) -> EvaluationReport:
@@ -38,35 +45,57 @@ def ship(run: Path, episodes: int, scenes: int) -> EvaluationReport:
     """
     agent, config, facts = checkpoint.load_policy(run / "best.safetensors")
     config = dataclasses.replace(config, out=f"runs/{config.env_id}")
-    origin = {"steps": facts["steps"], "half": True}
-    save = partial(checkpoint.save_policy, agent=agent, config=config, **origin)
-    with tempfile.TemporaryDirectory() as folder:
-        draft = Path(folder) / "rounded.safetensors"
-        save(draft, evaluation={})
-        rounded, *_ = checkpoint.load_policy(draft)
-    sentences = len(catalog.get(config.env_id).sentences)
+    env_id, steps = config.env_id, facts["steps"]
     play: dict[str, Any] = {
-        "seed": EVALUATION_SEED,
         "frames": config.frames,
         "env_kwargs": config.env_kwargs(training=False),
         "progress": True,
     }
+    states = seen(agent.policy, env_id, seed=config.eval_seed, **play)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "rounded.safetensors"
+        checkpoint.save_policy(
+            path, agent, config, steps=steps, evaluation={}, states=states
+        )
+        stored = checkpoint.read(path)
+        rounded, *_ = checkpoint.load_policy(path)
+    play["seed"] = EVALUATION_SEED
+    sentences = len(catalog.get(env_id).sentences)
     report = evaluate_policy(
-        rounded.policy, config.env_id, episodes=episodes * sentences, **play
+        rounded.policy, env_id, episodes=episodes * sentences, **play
     )
     figures = {**report.as_dict(), "commit": _commit()}
     if sentences > 1:
-        same = evaluate_scenes(rounded.policy, config.env_id, scenes=scenes, **play)
+        same = evaluate_scenes(rounded.policy, env_id, scenes=scenes, **play)
         figures["same_scene"] = same.as_dict()
-    path = FOLDER / f"{config.env_id}.safetensors"
+    path = FOLDER / f"{env_id}.safetensors"
     path.parent.mkdir(exist_ok=True)
-    save(path, evaluation=figures)
-    about = {"run": run.resolve().name, "steps": facts["steps"]}
+    metadata = {**stored.metadata, "evaluation": figures}
+    checkpoint.write(path, dataclasses.replace(stored, metadata=metadata))
+    about = {"run": run.resolve().name, "steps": steps}
     about["training_seed"] = config.seed
     path.with_suffix(".json").write_text(
         json.dumps({**about, **figures}, indent=2) + "\n"
     )
     return report
+
+
+def seen(policy: Policy, env_id: str, **play: Any) -> State:
+    """Return the states [N, ...] that a policy comes to in the scenes it is chosen by.
+
+    Args:
+        policy: Acts without noise.
+        env_id: The task.
+        **play: Whatever else `evaluate_policy` needs.
+    """
+    states: list[State] = []
+
+    def watched(state: State) -> Tensor:
+        states.append({key: value.clone() for key, value in state.items()})
+        return policy(state)
+
+    evaluate_policy(watched, env_id, episodes=SEEN_EPISODES, **play)
+    return {key: torch.cat([state[key] for state in states]) for key in states[0]}
 
 
 def _commit() -> str:

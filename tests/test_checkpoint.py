@@ -15,11 +15,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
-from toy_envs import ToyVectorEnv, toy_config
+from toy_envs import SPEC, ToyVectorEnv, toy_config, toy_state
 
-from ir_maniskill.agent import Agent, StateSpec
+from ir_maniskill.agent import Agent
 from ir_maniskill.environment.reward_generator import DenseWeights
-from ir_maniskill.training import checkpoint
+from ir_maniskill.training import checkpoint, quantize
 from ir_maniskill.training.checkpoint import CheckpointError, Stored
 from ir_maniskill.training.config import (
     CONFIGS,
@@ -35,18 +35,6 @@ from ir_maniskill.training.finite import TrainingDivergedError
 from ir_maniskill.training.run_folder import RunFolder
 from ir_maniskill.training.train import Trainer
 
-SPEC = StateSpec(2, 3, 0, 0, 0, 2, 2, 7, 2)
-
-
-def make_state(n=3):
-    return {
-        "instruction": torch.ones(n, 2, dtype=torch.long),
-        "proprioception": torch.rand(n, 3, 2),
-        "target": torch.rand(n, 3, 2),
-        "touch": torch.zeros(n, 3, 2),
-        "privileged": torch.rand(n, 7),
-    }
-
 
 @pytest.fixture
 def trained(tmp_path):
@@ -54,7 +42,7 @@ def trained(tmp_path):
     config = toy_config(tmp_path)
     agent = Agent(config.agent, SPEC)
     optimizer = torch.optim.Adam(agent.parameters(), 1e-3)
-    state = make_state()
+    state = toy_state()
     judgement = agent.evaluate_actions(state, torch.zeros(3, 2))
     (judgement.log_prob.sum() + judgement.value.sum()).backward()
     optimizer.step()
@@ -238,15 +226,16 @@ def test_random_generators_go_on_where_they_were():
     assert draw() == first
 
 
-@pytest.mark.parametrize("half", [False, True])
-def test_a_policy_acts_after_loading_as_before(trained, tmp_path, half):
+@pytest.mark.parametrize("few_bits", [False, True])
+def test_a_policy_acts_after_loading_as_before(trained, tmp_path, few_bits):
     agent, _, config = trained
     path = tmp_path / "policy.safetensors"
-    figures = {"success": 1.0}
-    checkpoint.save_policy(path, agent, config, steps=7, evaluation=figures, half=half)
+    facts = {"steps": 7, "evaluation": (figures := {"success": 1.0})}
+    states = toy_state(64) if few_bits else None
+    checkpoint.save_policy(path, agent, config, **facts, states=states)
     loaded, stored_config, metadata = checkpoint.load_policy(path)
-    state = make_state()
-    tolerance = 1e-3 if half else 0
+    state = toy_state()
+    tolerance = 1e-3 if few_bits else 0
     assert torch.allclose(loaded.policy(state), agent.policy(state), atol=tolerance)
     assert stored_config == config
     assert (metadata["steps"], metadata["evaluation"]) == (7, figures)
@@ -257,13 +246,14 @@ def test_a_policy_acts_after_loading_as_before(trained, tmp_path, half):
 def test_a_policy_file_is_smaller_than_a_checkpoint(trained, tmp_path):
     agent, optimizer, config = trained
     small, large = tmp_path / "policy", tmp_path / "checkpoint"
-    checkpoint.save_policy(small, agent, config, steps=0, evaluation={}, half=True)
+    policy = {"steps": 0, "evaluation": {}, "states": toy_state()}
+    checkpoint.save_policy(small, agent, config, **policy)
     facts = checkpoint.describe(agent, config)
     packed = checkpoint.pack(agent, optimizer)
     checkpoint.write(large, Stored(checkpoint.CHECKPOINT, packed, facts))
-    assert small.stat().st_size < large.stat().st_size / 4
+    assert small.stat().st_size < large.stat().st_size / 6
     agent_of_checkpoint, _, _ = checkpoint.load_policy(large)
-    assert agent_of_checkpoint.act(make_state()).value.shape == (3,)
+    assert agent_of_checkpoint.act(toy_state()).value.shape == (3,)
 
 
 def test_a_crash_while_writing_leaves_the_old_file(trained, tmp_path, monkeypatch):
@@ -281,19 +271,21 @@ def test_a_crash_while_writing_leaves_the_old_file(trained, tmp_path, monkeypatc
     assert [file.name for file in tmp_path.iterdir()] == ["policy"]
 
 
-def write_both(folder, agent, optimizer, config):
+def write_both(folder, monkeypatch, agent, optimizer, config):
     """Write a policy and a checkpoint of the same agent; return their paths."""
+    monkeypatch.setattr(quantize, "LARGE", 2000)  # some weights have 4 bits, some 8
     paths = folder / "policy", folder / "checkpoint"
-    checkpoint.save_policy(paths[0], agent, config, steps=1, evaluation={}, half=True)
+    policy = {"steps": 1, "evaluation": {}, "states": toy_state()}
+    checkpoint.save_policy(paths[0], agent, config, **policy)
     facts = checkpoint.describe(agent, config, steps=1)
     packed = checkpoint.pack(agent, optimizer)
     checkpoint.write(paths[1], Stored(checkpoint.CHECKPOINT, packed, facts))
     return paths
 
 
-def test_500_mutated_files_each_get_the_one_clear_error(trained, tmp_path):
+def test_500_mutated_files_each_get_the_one_clear_error(trained, tmp_path, monkeypatch):
     generator = random.Random(0)
-    for path in write_both(tmp_path, *trained):
+    for path in write_both(tmp_path, monkeypatch, *trained):
         good = path.read_bytes()
         header = 8 + int.from_bytes(good[:8], "little")
         for case in range(250):
@@ -350,17 +342,17 @@ def distort(stored, generator):
 
 
 def test_500_files_of_wrong_values_but_right_checksums_work_or_get_the_error(
-    trained, tmp_path
+    trained, tmp_path, monkeypatch
 ):
     generator, refused = random.Random(0), 0
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    for path in write_both(tmp_path, *trained):
+    for path in write_both(tmp_path, monkeypatch, *trained):
         stored = checkpoint.read(path)
         for _ in range(250):
             checkpoint.write(path, distort(stored, generator))
             try:
                 agent, *_ = checkpoint.load_policy(path)
-                assert agent.policy(make_state()).isfinite().all()
+                assert agent.policy(toy_state()).isfinite().all()
             except CheckpointError:
                 refused += 1
             except ValueError as error:  # its weights fit, the state does not

@@ -6,17 +6,22 @@ from types import SimpleNamespace
 
 import pytest
 import ship_policy
-from toy_envs import toy_config
+from toy_envs import SPEC, toy_config, toy_state
 
-from ir_maniskill.agent import Agent, StateSpec
+from ir_maniskill.agent import Agent
 from ir_maniskill.training import checkpoint
-from ir_maniskill.training.evaluate import Rate, SceneReport
+from ir_maniskill.training.evaluate import EVALUATION_SEED, Rate, SceneReport
 
 TASK = {1: "NaoTouchCubeSingle-v1", 3: "NaoTouchCubeShuffled-v1"}
 
 
+STATE = toy_state(20)
+
+
 def fake_report(policy, env_id, *, episodes, **_):
-    return SimpleNamespace(as_dict=lambda: {"env_id": env_id, "episodes": episodes})
+    acts = policy(STATE).tolist()
+    figures = {"env_id": env_id, "episodes": episodes, "acts": acts}
+    return SimpleNamespace(as_dict=lambda: figures)
 
 
 def fake_scenes(policy, env_id, *, scenes, seed, **_):
@@ -26,7 +31,7 @@ def fake_scenes(policy, env_id, *, scenes, seed, **_):
 def make_run(folder, task):
     """Write the best policy of a run."""
     config = dataclasses.replace(toy_config(folder), env_id=task, seed=5)
-    agent = Agent(config.agent, StateSpec(2, 3, 0, 0, 0, 2, 2, 7, 2))
+    agent = Agent(config.agent, SPEC)
     folder.mkdir()
     path = folder / "best.safetensors"
     checkpoint.save_policy(path, agent, config, steps=4096, evaluation={})
@@ -36,9 +41,11 @@ def make_run(folder, task):
 def test_what_shipped_before_stays_until_the_new_policy_is_evaluated(
     tmp_path, monkeypatch
 ):
-    def fail(*_, **__):
+    def fail(*args, seed, **kwargs):
         assert (tmp_path / f"{TASK[1]}.safetensors").read_bytes() == b"old"
-        raise KeyboardInterrupt
+        if seed == EVALUATION_SEED:
+            raise KeyboardInterrupt
+        return fake_report(*args, **kwargs)
 
     monkeypatch.setattr(ship_policy, "FOLDER", tmp_path)
     monkeypatch.setattr(ship_policy, "evaluate_policy", fail)
@@ -63,5 +70,8 @@ def test_a_shipped_policy_has_its_figures_and_origin(tmp_path, monkeypatch, sent
     if sentences > 1:
         assert data["same_scene"]["scenes"] == 10
         assert data["same_scene"]["exclusive"] == 0.9
-    *_, facts = checkpoint.load_policy(stem.with_suffix(".safetensors"))
+    agent, _, facts = checkpoint.load_policy(stem.with_suffix(".safetensors"))
     assert facts["evaluation"]["commit"] == "0" * 40 and facts["steps"] == 4096
+    assert agent.policy(STATE).tolist() == data["acts"], "another one was evaluated"
+    learned, *_ = checkpoint.load_policy(run / "best.safetensors")
+    assert learned.policy(STATE).tolist() != data["acts"], "it was not rounded"

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box
 
+from ir_maniskill.agent import StateSpec
 from ir_maniskill.experiment import VOCABULARY
 from ir_maniskill.training.config import AgentConfig, PPOConfig, TrainConfig
 
@@ -13,6 +14,20 @@ LENGTH = 8  # steps of an episode
 JOINTS, FINGERS = 2, 2
 SENTENCES = ("Go left.", "Go right.")
 GOALS = torch.tensor([-0.6, 0.6])
+
+SPEC = StateSpec(2, 3, 0, 0, 0, JOINTS, FINGERS, 7, JOINTS)
+"""Shapes of `toy_state`, and of a toy agent that reads and does as much."""
+
+
+def toy_state(n=3):
+    """Return a state of n envs, at random."""
+    return {
+        "instruction": torch.ones(n, 2, dtype=torch.long),
+        "proprioception": torch.rand(n, 3, JOINTS),
+        "target": torch.rand(n, 3, JOINTS),
+        "touch": torch.zeros(n, 3, FINGERS),
+        "privileged": torch.rand(n, 7),
+    }
 
 
 class ToyVectorEnv:

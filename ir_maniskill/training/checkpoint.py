@@ -24,8 +24,10 @@ from safetensors.torch import save as format_tensors
 from torch import Tensor
 
 from ir_maniskill.agent.agent import Agent, StateSpec
+from ir_maniskill.environment.state import State
 from ir_maniskill.training.config import TrainConfig, decode
 from ir_maniskill.training.finite import check_finite
+from ir_maniskill.training.quantize import dequantize, quantize
 
 CHECKPOINT = "ir_maniskill checkpoint 1"
 POLICY = "ir_maniskill policy 1"
@@ -193,7 +195,7 @@ def save_policy(
     *,
     steps: int,
     evaluation: Mapping[str, Any],
-    half: bool = False,
+    states: State | None = None,
 ) -> None:
     """Write the weights that act, with where they come from and how good they are.
 
@@ -203,13 +205,16 @@ def save_policy(
         config: How it was trained.
         steps: Environment steps it was trained for.
         evaluation: Figures of its evaluation, plain data.
-        half: Store 16 instead of 32 bits a weight.
+        states: What it has seen [N, ...], to store few bits a weight (`quantize`), such
+            that it acts there much as before; None: all bits.
     """
     weights = {
-        name: weight.half() if half and weight.is_floating_point() else weight
+        name: weight
         for name, weight in agent.state_dict().items()
         if not name.startswith(TRAINING_ONLY)
     }
+    if states is not None:
+        weights = quantize(agent, weights, states)
     facts = describe(agent, config, steps=steps, evaluation=dict(evaluation))
     write(path, Stored(POLICY, weights, facts))
 
@@ -241,14 +246,15 @@ def _agent(config: TrainConfig, spec: StateSpec, stored: Stored) -> Agent:
     Sizes that the file claims take no memory before they are known to be right.
     """
     complete = stored.kind == CHECKPOINT
-    weights = _under("agent", stored.tensors) if complete else stored.tensors
+    weights = dequantize(
+        _under("agent", stored.tensors) if complete else stored.tensors
+    )
     lists = (config.agent.hidden, config.agent.vision_channels)
     if max(config.agent.language_layers, *map(len, lists)) > len(weights):
         raise ValueError("more layers than weights")
     with torch.device("meta"):
         agent = Agent(config.agent, spec, policy_only=not complete)
-    single = {k: v.float() if v.is_floating_point() else v for k, v in weights.items()}
-    agent.load_state_dict(single, assign=True)
+    agent.load_state_dict(weights, assign=True)
     return agent
 
 
