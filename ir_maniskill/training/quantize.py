@@ -49,10 +49,10 @@ def quantize(
     stored: dict[str, Tensor] = {}
     for name, weight in weights.items():
         if name in moments:
-            small = weight.numel() < LARGE or weight.shape[1] % 2
-            bits = 8 if small else 4
+            pairs = weight.numel() >= LARGE and weight.shape[1] % 2 == 0
+            bits = 4 if pairs else 8
             numbers, scale = round_weights(weight, moments[name], bits)
-            stored[name] = numbers if small else _pair(numbers)
+            stored[name] = _pair(numbers) if pairs else numbers
             stored[name + SCALE] = scale
         else:
             stored[name] = weight.half() if weight.is_floating_point() else weight
