@@ -41,10 +41,11 @@ def test_where_inputs_have_nothing_to_do_with_each_other_each_weight_is_rounded(
 
 
 def test_the_next_weight_makes_up_for_what_rounding_the_last_one_changed():
-    weight = torch.tensor([[7.0, 1.4, 1.4]])
+    weight = torch.tensor([[7.0, 1.4, 1.4]], dtype=torch.double)
     together = torch.tensor([[1.0, 0, 0], [0, 1, 1], [0, 1, 1]])  # inputs 1 and 2
     numbers, _ = round_weights(weight, together, bits=4)
     assert numbers.tolist() == [[7, 1, 2]]  # 3 for 2.8, where each by itself gives 2
+    assert weight.tolist() == [[7.0, 1.4, 1.4]]  # what is given stays as it is
 
 
 def test_rows_of_zeros_and_inputs_that_never_come_are_no_trouble():
