@@ -86,7 +86,7 @@ def round_weights(weight: Tensor, moment: Tensor, bits: int) -> tuple[Tensor, Te
         weights.
     """
     top = 2 ** (bits - 1) - 1
-    left = weight.to(torch.double, copy=True)  # what is still to be expressed
+    left = weight.to("cpu", torch.double, copy=True)  # still to be expressed
     scale = (left.abs().amax(dim=1) / top).float().clamp_min(1e-12)
     unit = scale.double()
     extra = (DAMPING * moment.diagonal().mean()).clamp_min(1e-12)
