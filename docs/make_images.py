@@ -19,9 +19,9 @@ from PIL import Image, ImageDraw, ImageFont
 import ir_maniskill  # noqa: F401 - registers the tasks
 from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.state import CAMERAS
+from ir_maniskill.evaluation.evaluate import EVALUATION_SEED
+from ir_maniskill.evaluation.video import record, write_video
 from ir_maniskill.training.checkpoint import load_policy
-from ir_maniskill.training.evaluate import EVALUATION_SEED
-from ir_maniskill.training.video import record, write_video
 
 FOLDER = Path(__file__).parent / "images"
 PAGE, INK, FAINT = (18, 20, 24), (238, 240, 244), (150, 156, 168)

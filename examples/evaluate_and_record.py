@@ -14,14 +14,14 @@ import torch
 import tyro
 from torch import Tensor
 
-from ir_maniskill.training.checkpoint import load_policy
-from ir_maniskill.training.config import CONFIGS
-from ir_maniskill.training.evaluate import (
+from ir_maniskill.evaluation.evaluate import (
     EVALUATION_SEED,
     evaluate_policy,
     write_report,
 )
-from ir_maniskill.training.video import record, write_video
+from ir_maniskill.evaluation.video import record, write_video
+from ir_maniskill.training.checkpoint import load_policy
+from ir_maniskill.training.config import CONFIGS
 
 
 def random_policy(state: dict[str, Tensor]) -> Tensor:

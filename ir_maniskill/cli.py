@@ -19,19 +19,20 @@ from tyro.conf import Positional, arg, subcommand
 from ir_maniskill import doctor
 from ir_maniskill import experiment as catalog
 from ir_maniskill.agent.agent import Agent
+from ir_maniskill.evaluation import plots, video
+from ir_maniskill.evaluation.evaluate import (
+    EVALUATION_SEED,
+    evaluate_policy,
+    write_report,
+)
 from ir_maniskill.experiment import Experiment
-from ir_maniskill.training import distributed, plots, video
+from ir_maniskill.training import distributed
 from ir_maniskill.training.checkpoint import load_policy, writing
 from ir_maniskill.training.config import (
     CONFIGS,
     RenderBackend,
     SimBackend,
     TrainConfig,
-)
-from ir_maniskill.training.evaluate import (
-    EVALUATION_SEED,
-    evaluate_policy,
-    write_report,
 )
 from ir_maniskill.training.train import train
 

@@ -22,14 +22,14 @@ from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.instructional_set import InstructionalSet
 from ir_maniskill.environment.state import State
 from ir_maniskill.environment.vector import make_vec
-from ir_maniskill.experiment import Experiment
-from ir_maniskill.training.checkpoint import load_policy
-from ir_maniskill.training.evaluate import (
+from ir_maniskill.evaluation.evaluate import (
     EVALUATION_SEED,
     Policy,
     evaluate_policy,
     versions,
 )
+from ir_maniskill.experiment import Experiment
+from ir_maniskill.training.checkpoint import load_policy
 
 ROOT = Path(__file__).parent.parent
 OUT = ROOT / "docs" / "results" / "controls.json"

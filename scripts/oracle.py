@@ -33,14 +33,14 @@ from tqdm import tqdm
 
 import ir_maniskill  # noqa: F401 - registers the tasks
 from ir_maniskill import experiment as catalog
-from ir_maniskill.environment.robot.nao import (
+from ir_maniskill.environment.robots.nao import (
     ARM,
     ARM_JOINTS,
     FINGER_JOINTS,
     HAND,
     JOINTS,
 )
-from ir_maniskill.training.evaluate import EVALUATION_SEED, versions
+from ir_maniskill.evaluation.evaluate import EVALUATION_SEED, versions
 
 OUT = Path(__file__).parent.parent / "docs" / "results" / "oracle.json"
 DELTA = np.array([(HAND if j[1:] in FINGER_JOINTS else ARM).delta for j in JOINTS])

@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 
 from ir_maniskill import experiment as catalog
+from ir_maniskill.evaluation.plots import Curve, compare
 from ir_maniskill.training.config import CONFIGS, TrainConfig, decode, to_json
-from ir_maniskill.training.plots import Curve, compare
 from ir_maniskill.training.run_folder import whole_rows
 
 Figures = Mapping[str, Any]

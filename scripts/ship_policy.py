@@ -20,14 +20,14 @@ from torch import Tensor
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.state import State
-from ir_maniskill.training import checkpoint
-from ir_maniskill.training.evaluate import (
+from ir_maniskill.evaluation.evaluate import (
     EVALUATION_SEED,
     EvaluationReport,
     Policy,
     evaluate_policy,
     evaluate_scenes,
 )
+from ir_maniskill.training import checkpoint
 
 FOLDER = Path(__file__).parent.parent / "assets" / "policies"
 

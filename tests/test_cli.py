@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from ir_maniskill import cli, experiment
 from ir_maniskill.agent.agent import Agent, StateSpec
-from ir_maniskill.training import evaluate
+from ir_maniskill.evaluation import evaluate
 from ir_maniskill.training.checkpoint import save_policy
 from ir_maniskill.training.config import (
     CONFIGS,

@@ -88,7 +88,7 @@ def silent(doc: pdoc.doc.Doc) -> list[str]:
 
 
 def test_all_that_is_public_has_a_docstring() -> None:
-    for name in ("tasks.single", "assets.nao.build", "environment.robot.nao"):
+    for name in ("tasks.single", "assets.nao.build", "environment.robots.nao"):
         assert f"ir_maniskill.{name}" in MODULES
     mute = [n for m in MODULES for n in silent(pdoc.doc.Module.from_name(m))]
     assert mute == []

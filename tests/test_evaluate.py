@@ -8,8 +8,8 @@ import pytest
 import torch
 
 import ir_maniskill
-from ir_maniskill.training import evaluate
-from ir_maniskill.training.evaluate import Rate, evaluate_policy, evaluate_scenes
+from ir_maniskill.evaluation import evaluate
+from ir_maniskill.evaluation.evaluate import Rate, evaluate_policy, evaluate_scenes
 
 STEPS = 4
 SENTENCES = ("Touch the blue cube.", "Touch the red cube.")

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from ir_maniskill import available, cli
-from ir_maniskill.environment.robot.nao import ARM, HAND
+from ir_maniskill.environment.robots.nao import ARM, HAND
 from ir_maniskill.experiment import get
 from ir_maniskill.training.config import CONFIGS
 
@@ -23,7 +23,7 @@ TINY = """
 import runpy, sys
 from dataclasses import replace
 import ir_maniskill.training.train as loop
-import ir_maniskill.training.video as video
+import ir_maniskill.evaluation.video as video
 from ir_maniskill.training.config import CONFIGS, PPOConfig
 loop.FINAL_EPISODES, video.SHARPNESS = 2, 0.1
 small = dict(num_envs=2, num_workers=1, eval_episodes=2, ppo=PPOConfig(rollouts=2,

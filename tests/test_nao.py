@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from ir_maniskill.environment.robot.nao import FINGERS, JOINTS, Nao
-from ir_maniskill.environment.robot.robot import Robot, RobotError, TargetController
+from ir_maniskill.environment.robots.nao import FINGERS, JOINTS, Nao
+from ir_maniskill.environment.robots.robot import Robot, RobotError, TargetController
 from ir_maniskill.environment.touch_env import TouchEnv
 
 ABSOLUTE, DELTA = "pd_joint_pos", "pd_joint_target_delta_pos"

@@ -18,9 +18,9 @@ import ir_maniskill
 from ir_maniskill import Jitter
 from ir_maniskill import experiment as catalog
 from ir_maniskill.assets.nao import URDF_PATH, facts
-from ir_maniskill.environment.robot.nao import JOINTS, Nao
-from ir_maniskill.environment.robot.nao_urdf import adapt
-from ir_maniskill.environment.robot.robot import RobotError
+from ir_maniskill.environment.robots.nao import JOINTS, Nao
+from ir_maniskill.environment.robots.nao_urdf import adapt
+from ir_maniskill.environment.robots.robot import RobotError
 
 VARIABLE = "IR_MANISKILL_NAO_URDF"
 MESHES = "package://nao_meshes/meshes"

@@ -7,7 +7,7 @@ import oracle
 import pytest
 from oracle import PLAN, SIDE, Effort, Efforts, Known, Outcome
 
-from ir_maniskill.environment.robot.nao import JOINTS
+from ir_maniskill.environment.robots.nao import JOINTS
 
 TASK, SEED = "NaoTouchCubeTriangle-v1", 2_000_000
 

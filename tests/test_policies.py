@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from ir_maniskill.evaluation.evaluate import Policy, Score, evaluate_policy
 from ir_maniskill.training.checkpoint import load_policy
 from ir_maniskill.training.config import TrainConfig
-from ir_maniskill.training.evaluate import Policy, Score, evaluate_policy
 
 SHIPPED = sorted(Path(str(files("ir_maniskill.assets"))).glob("policies/*.safetensors"))
 

@@ -9,7 +9,7 @@ import results
 from results import ResultsError, Run
 
 from ir_maniskill import cli
-from ir_maniskill.training import plots
+from ir_maniskill.evaluation import plots
 from ir_maniskill.training.config import CONFIGS, to_json
 
 TRIANGLE = "NaoTouchCubeTriangle-v1"

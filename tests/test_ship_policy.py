@@ -9,8 +9,8 @@ import ship_policy
 from toy_envs import SPEC, toy_config, toy_state
 
 from ir_maniskill.agent import Agent
+from ir_maniskill.evaluation.evaluate import EVALUATION_SEED, Rate, SceneReport
 from ir_maniskill.training import checkpoint
-from ir_maniskill.training.evaluate import EVALUATION_SEED, Rate, SceneReport
 
 TASK = {1: "NaoTouchCubeSingle-v1", 3: "NaoTouchCubeShuffled-v1"}
 

@@ -21,7 +21,7 @@ from trees import leaves
 
 import ir_maniskill
 from ir_maniskill import experiment as catalog
-from ir_maniskill.environment.robot.nao import JOINTS
+from ir_maniskill.environment.robots.nao import JOINTS
 from ir_maniskill.environment.touch_env import TouchEnv
 from ir_maniskill.experiment import Jitter
 

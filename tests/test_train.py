@@ -13,11 +13,11 @@ import ir_maniskill
 from ir_maniskill import experiment as catalog
 from ir_maniskill.agent.actor import Actor
 from ir_maniskill.environment.reward_generator import DenseWeights
+from ir_maniskill.evaluation.evaluate import EvaluationReport, Rate, Score
 from ir_maniskill.training import checkpoint, distributed
 from ir_maniskill.training import train as training
 from ir_maniskill.training.checkpoint import CheckpointError
 from ir_maniskill.training.config import AgentConfig, ConfigError, TrainConfig
-from ir_maniskill.training.evaluate import EvaluationReport, Rate, Score
 from ir_maniskill.training.finite import TrainingDivergedError
 from ir_maniskill.training.run_folder import RunFolder
 from ir_maniskill.training.train import train

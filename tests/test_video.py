@@ -5,10 +5,17 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 
-from ir_maniskill.environment.robot.nao import FINGERS
-from ir_maniskill.training import plots, video
-from ir_maniskill.training.evaluate import evaluate_policy
-from ir_maniskill.training.video import RIGHT, SIZE, WRONG, Snapshot, draw, write_video
+from ir_maniskill.environment.robots.nao import FINGERS
+from ir_maniskill.evaluation import plots, video
+from ir_maniskill.evaluation.evaluate import evaluate_policy
+from ir_maniskill.evaluation.video import (
+    RIGHT,
+    SIZE,
+    WRONG,
+    Snapshot,
+    draw,
+    write_video,
+)
 
 
 def snapshot(step=3, right=(), wrong=(), history=((False, False),) * 3):

@@ -10,11 +10,11 @@ from torch.distributions import Normal
 
 from ir_maniskill.agent.actor import Actor, tanh_layers
 from ir_maniskill.agent.alignment import Alignment
+from ir_maniskill.agent.config import AgentConfig
 from ir_maniskill.agent.critic import Critic, Standardize
 from ir_maniskill.agent.language_system import LanguageSystem
 from ir_maniskill.agent.perceptual_system import BodySense, PaperVision, PatchVision
 from ir_maniskill.environment.state import State
-from ir_maniskill.training.config import AgentConfig
 
 
 @dataclass(frozen=True)

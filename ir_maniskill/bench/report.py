@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from ir_maniskill.training import evaluate
+from ir_maniskill.evaluation import evaluate
 
 
 @dataclass(frozen=True)

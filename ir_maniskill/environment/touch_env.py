@@ -25,8 +25,8 @@ from ir_maniskill.environment import reward_generator, table_scene
 from ir_maniskill.environment.bodies import positions, speeds
 from ir_maniskill.environment.instructional_set import InstructionalSet
 from ir_maniskill.environment.reward_generator import DenseWeights, FingerCount
-from ir_maniskill.environment.robot.nao import Nao
-from ir_maniskill.environment.robot.robot import (
+from ir_maniskill.environment.robots.nao import Nao
+from ir_maniskill.environment.robots.robot import (
     Robot,
     available_robots,
     require_robot,

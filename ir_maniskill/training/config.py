@@ -6,124 +6,21 @@ our tuned values; both run the same code.
 
 import dataclasses
 import json
-import math
 import types
 import typing
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
+from ir_maniskill.agent.config import AgentConfig
+from ir_maniskill.checks import ConfigError, require, require_choice
 from ir_maniskill.environment.reward_generator import DenseWeights
 
-Sense = Literal["vision", "proprioception", "touch", "state"]
-Vision = Literal["patches", "paper"]
-CriticInput = Literal["asymmetric", "separate", "shared"]
 ControlMode = Literal["pd_joint_target_delta_pos", "pd_joint_pos"]
 RewardMode = Literal["dense", "normalized_dense", "sparse"]
 SimBackend = Literal["physx_cpu", "physx_cuda"]
 RenderBackend = Literal["auto", "cpu"]
-StdMode = Literal["annealed", "decayed", "fixed", "learned"]
 
 Config = TypeVar("Config")
-
-
-class ConfigError(ValueError):
-    """A configuration value that cannot be used: what was got, what is expected."""
-
-
-def _require(condition: bool, name: str, got: object, expected: str) -> None:
-    if not condition:
-        raise ConfigError(f"{name}: got {got!r}, expected {expected}")
-
-
-def _require_choice(name: str, got: str, annotation: Any) -> None:
-    choices = typing.get_args(annotation)
-    _require(got in choices, name, got, "one of " + ", ".join(map(repr, choices)))
-
-
-@dataclass(frozen=True)
-class AgentConfig:
-    """Shape of the learner: which boxes it has, and how wide they are."""
-
-    senses: tuple[Sense, ...] | None = ("vision", "proprioception", "touch")
-    """What the actor perceives beside the sentence; None: the experiment's own senses.
-    "state" is the simulator's own state, for finding out what can be learned."""
-    sees_target: bool = True
-    """Whether proprioception includes the joint targets (needed by delta actions)."""
-    vocabulary: int = 10
-    """Number of token ids, <pad> = 0 included; training takes the experiment's."""
-    language_layers: int = 3
-    """Transformer encoder layers."""
-    language_heads: int = 2
-    """Attention heads a layer."""
-    language_width: int = 50
-    """Units of each token's representation."""
-    vision: Vision = "patches"
-    """"paper": two 5x5 convolutions over the cameras side by side; "patches": a
-    convolution over 4x4 patches of each camera, then 3x3 ones, all normalized, and
-    so is H_t then."""
-    vision_channels: tuple[int, ...] = (32, 32, 32)
-    """Channels of the convolutions of "patches"; the second halves the maps."""
-    film: bool = True
-    """Whether the sentence modulates the convolutions over patches (FiLM)."""
-    vision_width: int = 256
-    """Units of V_t."""
-    body_width: int = 128
-    """Units of H_t."""
-    posture_gain: float = 0.0
-    """How strongly mean actions, changes of the joint targets, draw these toward the
-    posture that the actor's layers then give; 0: the layers give the action itself."""
-    posture_gain_final: float | None = None
-    """The same at the end, approached by the same amount each step; None: it stays."""
-    hidden: tuple[int, ...] = (500, 256, 128)
-    """Units of the actor's and the critic's tanh layers."""
-    critic: CriticInput = "asymmetric"
-    """What the critic reads: the simulator's state instead of images, its own encoder
-    of the actor's senses, or the actor's B_t."""
-    std_mode: StdMode = "annealed"
-    """How the standard deviation of the action noise evolves: to `std_final` by the
-    same amount ("annealed") or the same factor ("decayed") each step, not at all, or as
-    it is learned."""
-    std: float = 0.5
-    """Standard deviation of the action noise at the start."""
-    std_final: float = 0.05
-    """Standard deviation at the end, if annealed or decayed."""
-    auxiliary_weight: float = 3.0
-    """Weight of the loss that predicts where the named object is; 0: no such head."""
-
-    def __post_init__(self) -> None:
-        """Refuse values that cannot work."""
-        for sense in self.senses or ():
-            _require_choice("senses", sense, Sense)
-        _require(self.senses != (), "senses", self.senses, "at least one, or None")
-        _require_choice("vision", self.vision, Vision)
-        _require_choice("critic", self.critic, CriticInput)
-        _require_choice("std_mode", self.std_mode, StdMode)
-        positive = "vocabulary language_layers language_heads vision_width body_width"
-        for name in positive.split():
-            _require(getattr(self, name) > 0, name, getattr(self, name), "at least 1")
-        width, heads = self.language_width, self.language_heads
-        fits = width > 0 and width % heads == 0
-        _require(fits, "language_width", width, f"a multiple of {heads} heads")
-        for name in ("vision_channels", "hidden"):
-            units = getattr(self, name)
-            fits = bool(units) and min(units) > 0
-            _require(fits, name, units, "one or more positive sizes")
-        _require(self.std > 0, "std", self.std, "more than 0")
-        _require(self.std_final > 0, "std_final", self.std_final, "more than 0")
-        weight = self.auxiliary_weight
-        _require(weight >= 0, "auxiliary_weight", weight, "0 or more")
-        gain, senses = self.posture_gain, self.senses
-        _require(
-            0 <= gain < math.inf, "posture_gain", gain, "a finite number of at least 0"
-        )
-        felt = senses is None or bool({"proprioception", "state"} & set(senses))
-        fits = gain == 0 or (felt and self.sees_target)
-        expected = "0 where the actor does not feel its joint targets"
-        _require(fits, "posture_gain", gain, expected)
-        final = self.posture_gain_final
-        fits = final is None or (gain > 0 and 0 < final < math.inf)
-        expected = "a finite number above 0 beside a posture_gain above 0, or None"
-        _require(fits, "posture_gain_final", final, expected)
 
 
 @dataclass(frozen=True)
@@ -166,20 +63,20 @@ class PPOConfig:
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
         for name in ("rollouts", "rollout_length", "epochs"):
-            _require(getattr(self, name) > 0, name, getattr(self, name), "at least 1")
+            require(getattr(self, name) > 0, name, getattr(self, name), "at least 1")
         batch, total = self.minibatch, self.rollouts * self.rollout_length
         fits = batch is None or 2 <= batch <= total
-        _require(fits, "minibatch", batch, f"2 to {total} steps, or None")
+        require(fits, "minibatch", batch, f"2 to {total} steps, or None")
         for name in ("gamma", "gae_lambda"):
             value = getattr(self, name)
-            _require(0 <= value <= 1, name, value, "0 to 1")
+            require(0 <= value <= 1, name, value, "0 to 1")
         for name in ("learning_rate", "clip"):
-            _require(getattr(self, name) > 0, name, getattr(self, name), "more than 0")
+            require(getattr(self, name) > 0, name, getattr(self, name), "more than 0")
         for name in ("value_weight", "entropy_weight"):
-            _require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more")
+            require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more")
         for name in ("max_kl", "target_kl", "max_grad_norm"):
             value = getattr(self, name)
-            _require(value is None or value > 0, name, value, "more than 0, or None")
+            require(value is None or value > 0, name, value, "more than 0, or None")
 
 
 @dataclass(frozen=True)
@@ -247,31 +144,31 @@ class TrainConfig:
         positive = "total_steps num_envs camera_height camera_width frames "
         positive += "eval_interval eval_episodes checkpoint_interval"
         for name in positive.split():
-            _require(getattr(self, name) > 0, name, getattr(self, name), "at least 1")
+            require(getattr(self, name) > 0, name, getattr(self, name), "at least 1")
         lenient, total = self.lenient_steps, self.total_steps
         expected = f"0 to {total}, the total_steps (a third of them, say)"
-        _require(0 <= lenient <= total, "lenient_steps", lenient, expected)
+        require(0 <= lenient <= total, "lenient_steps", lenient, expected)
         for name in ("num_workers", "threads"):
             value = getattr(self, name)
-            _require(value is None or value > 0, name, value, "at least 1, or None")
-        _require_choice("sim_backend", self.sim_backend, SimBackend)
-        _require_choice("render_backend", self.render_backend, RenderBackend)
-        _require_choice("control_mode", self.control_mode, ControlMode)
-        _require_choice("reward_mode", self.reward_mode, RewardMode)
+            require(value is None or value > 0, name, value, "at least 1, or None")
+        require_choice("sim_backend", self.sim_backend, SimBackend)
+        require_choice("render_backend", self.render_backend, RenderBackend)
+        require_choice("control_mode", self.control_mode, ControlMode)
+        require_choice("reward_mode", self.reward_mode, RewardMode)
         for name, bits in (("seed", 31), ("eval_seed", 29)):
             value = getattr(self, name)
-            _require(0 <= value < 2**bits, name, value, f"0 to 2**{bits} - 1")
+            require(0 <= value < 2**bits, name, value, f"0 to 2**{bits} - 1")
         gain = self.agent.posture_gain
         fits = gain == 0 or self.control_mode == "pd_joint_target_delta_pos"
         expected = "0 where actions do not change the joint targets (control_mode)"
-        _require(fits, "posture_gain", gain, expected)
+        require(fits, "posture_gain", gain, expected)
         rollouts = self.ppo.rollouts
         fits = rollouts % self.num_envs == 0
-        _require(fits, "num_envs", self.num_envs, f"a divisor of {rollouts} rollouts")
+        require(fits, "num_envs", self.num_envs, f"a divisor of {rollouts} rollouts")
         goal = self.stop_at_success
         fits = goal is None or 0 < goal <= 1
         expected = "more than 0, at most 1, or None"
-        _require(fits, "stop_at_success", goal, expected)
+        require(fits, "stop_at_success", goal, expected)
 
     @property
     def steps_per_env(self) -> int:
@@ -384,13 +281,13 @@ def decode(cls: type[Config], data: object) -> Config:
         ConfigError: If a field is unknown, missing, of another type than declared, or
             out of its range.
     """
-    _require(isinstance(data, dict), cls.__name__, data, "an object of its fields")
+    require(isinstance(data, dict), cls.__name__, data, "an object of its fields")
     known = LATER.get(cls.__name__, {})
     values = known | typing.cast("dict[str, object]", data)
     hints = typing.get_type_hints(cls)
     unknown, missing = sorted(values.keys() - hints), sorted(hints.keys() - values)
     expected = f"exactly its fields (missing: {missing}, unknown: {unknown})"
-    _require(not unknown and not missing, cls.__name__, sorted(values), expected)
+    require(not unknown and not missing, cls.__name__, sorted(values), expected)
     fields = {name: _decode(hints[name], values[name], name) for name in hints}
     try:
         return cls(**fields)
@@ -408,12 +305,12 @@ def _decode(hint: Any, value: Any, name: str) -> Any:
             return None
         return _decode(arguments[0], value, name)
     if origin is tuple:
-        _require(isinstance(value, list | tuple), name, value, "a list")
+        require(isinstance(value, list | tuple), name, value, "a list")
         return tuple(_decode(arguments[0], item, name) for item in value)
     if origin is Literal:
-        _require(value in arguments, name, value, f"one of {arguments}")
+        require(value in arguments, name, value, f"one of {arguments}")
         return value
     if hint is float and type(value) is int:
         return float(value)
-    _require(type(value) is hint, name, value, f"a value of type {hint.__name__}")
+    require(type(value) is hint, name, value, f"a value of type {hint.__name__}")
     return value

@@ -15,13 +15,15 @@ from tqdm import tqdm
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.agent.agent import Agent, StateSpec
+from ir_maniskill.agent.config import Sense
+from ir_maniskill.checks import ConfigError
 from ir_maniskill.environment.state import State, StateStack
 from ir_maniskill.environment.vector import VectorEnv, make_vec
+from ir_maniskill.evaluation.evaluate import EvaluationReport, evaluate_policy
 from ir_maniskill.experiment import Experiment
 from ir_maniskill.training import checkpoint, distributed, ppo
 from ir_maniskill.training.checkpoint import CheckpointError, Stored
-from ir_maniskill.training.config import ConfigError, Sense, TrainConfig, decode
-from ir_maniskill.training.evaluate import EvaluationReport, evaluate_policy
+from ir_maniskill.training.config import TrainConfig, decode
 from ir_maniskill.training.finite import TrainingDivergedError
 from ir_maniskill.training.rollout import RewardScale, Rollout, collect, to
 from ir_maniskill.training.run_folder import RunFolder

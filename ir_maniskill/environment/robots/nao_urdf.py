@@ -24,7 +24,7 @@ import numpy as np
 from trimesh.transformations import euler_from_matrix, euler_matrix, rotation_matrix
 
 from ir_maniskill.assets.nao import facts
-from ir_maniskill.environment.robot.robot import RobotError
+from ir_maniskill.environment.robots.robot import RobotError
 
 ROOT = "torso"
 """The link that stays at the origin; what it hangs on is left out."""

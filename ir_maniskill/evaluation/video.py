@@ -25,7 +25,7 @@ from PIL import Image, ImageDraw, ImageFont
 from ir_maniskill.environment.reward_generator import split_fingers
 from ir_maniskill.environment.state import CAMERAS, StateStack
 from ir_maniskill.environment.touch_env import CONTROL_FREQ
-from ir_maniskill.training.evaluate import Policy, choose_instructions, one_thread
+from ir_maniskill.evaluation.evaluate import Policy, choose_instructions, one_thread
 
 Box = tuple[int, int, int, int]
 """Left, top, width and height [pixel]."""

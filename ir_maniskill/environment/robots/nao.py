@@ -13,8 +13,8 @@ from typing import Any
 from mani_skill.agents.registration import register_agent
 
 from ir_maniskill.assets.nao import URDF_PATH
-from ir_maniskill.environment.robot.nao_urdf import adapt
-from ir_maniskill.environment.robot.robot import JointGroup, Robot
+from ir_maniskill.environment.robots.nao_urdf import adapt
+from ir_maniskill.environment.robots.robot import JointGroup, Robot
 
 # -- Joints: the action's order, all left then all right --------------------------
 

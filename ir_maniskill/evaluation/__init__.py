@@ -1,0 +1,1 @@
+"""What a learned policy does: figures with intervals, films, learning curves."""
