@@ -14,12 +14,20 @@ from ir_maniskill.experiment import (
     available,
     touch_instructions,
 )
+from ir_maniskill.goals import Avoid, Both, Goal, Push, Ref, Then, Touch
 from ir_maniskill.registration import register
 
 __all__ = [
+    "Avoid",
+    "Both",
     "Experiment",
+    "Goal",
     "Instruction",
     "Jitter",
+    "Push",
+    "Ref",
+    "Then",
+    "Touch",
     "TouchObject",
     "available",
     "make_vec",

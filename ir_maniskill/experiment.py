@@ -9,10 +9,16 @@ from __future__ import annotations
 import itertools
 import math
 import re
+import unicodedata
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from numbers import Integral, Real
 from typing import Any, Literal, get_args
+
+import torch
+
+from ir_maniskill.goals import COLORS, SHAPES, Goal, GoalError, Ref, Touch
+from ir_maniskill.snapshot import Snapshot
 
 VOCABULARY = (
     "<pad>",
@@ -31,36 +37,17 @@ VOCABULARY = (
 PAD, UNK = 0, 1
 """Ids of `<pad>`, which fills short sentences up, and of `<unk>`, any other word."""
 
-COLORS: dict[str, tuple[float, float, float]] = {
-    "blue": (0.05, 0.16, 0.85),
-    "red": (0.85, 0.06, 0.05),
-    "green": (0.04, 0.60, 0.12),
-    "yellow": (0.95, 0.75, 0.05),
-    "purple": (0.50, 0.10, 0.65),
-    "orange": (0.95, 0.40, 0.03),
-}
-"""Linear RGB of every color an object may have."""
-
 SENSES = ("vision", "proprioception", "touch")
 """The sensory modules that the Perceptual System may use."""
 
-SHAPES = ("cube", "button")
-"""A cube is a free 4 cm body, a button is fixed to the table."""
-
 OBJECT_SIZE = 0.04
 """Edge of a cube and diameter of a button [m]."""
-
-SHOULDERS = ((0.0, 0.098), (0.0, -0.098))
-"""Where the arms start, seen from above, in the torso frame (x, y) [m]."""
-
-REACH = 0.255
-"""Farthest that an object's center may be from a shoulder, seen from above [m]."""
 
 TABLE = ((0.10, 0.40), (-0.34, 0.34))
 """Extent of the table top along x and y [m]."""
 
 
-class ExperimentError(ValueError):
+class ExperimentError(GoalError):
     """An experiment is malformed: says what was got and what was expected."""
 
 
@@ -106,12 +93,21 @@ class TouchObject:
 
 @dataclass(frozen=True)
 class Instruction:
-    """An instruction i_t and the object that it asks to touch."""
+    """An instruction i_t and the goal that it asks for."""
 
     text: str
     """The sentence."""
-    target: str
-    """Name of the object, e.g. "blue cube"."""
+    goal: Goal
+    """What it asks for, e.g. `Touch(Ref("blue", "cube"))`."""
+
+    def __post_init__(self) -> None:
+        """Check the fields.
+
+        Raises:
+            ExperimentError: One has another type.
+        """
+        _check_type("instruction text", self.text, str)
+        _check_type("instruction goal", self.goal, Goal)
 
 
 @dataclass(frozen=True)
@@ -152,10 +148,10 @@ class Experiment:
     instructions: tuple[Instruction, ...]
     """The Instructional Set; one is drawn for every episode."""
     reward: RewardKind = "binary"
-    """"binary": 1 while the named object is touched (experiments I and II);
-    "per_finger": 1 for each finger on it (experiment III)."""
+    """"binary": 1 while the goal holds (experiments I and II); "per_finger": its level,
+    1 for each finger on the named object (experiment III)."""
     wrong_penalty: float = 0.0
-    """Taken from the reward for each finger on another object."""
+    """Penalty for each finger on another object."""
     senses: tuple[str, ...] = SENSES
     """What the paper's agent perceives here; subset of `SENSES`."""
     jitter: Jitter = field(default_factory=Jitter)
@@ -164,8 +160,9 @@ class Experiment:
     """Whether the objects swap places at random every episode."""
     episode_steps: int = 32
     """Length of an episode [control steps of 50 ms]."""
-    vocabulary: tuple[str, ...] = VOCABULARY
-    """Tokens known to the Language System, `<pad>` and `<unk>` first."""
+    vocabulary: tuple[str, ...] = ()
+    """Tokens known to the Language System, `<pad>` and `<unk>` first; derived from the
+    sentences if left out."""
 
     def __post_init__(self) -> None:
         """Check that the experiment can be built, said and reached.
@@ -184,6 +181,8 @@ class Experiment:
             _check_choice("sense", sense, SENSES)
         _check_tuple("objects", self.objects, TouchObject)
         _check_tuple("instructions", self.instructions, Instruction)
+        if self.vocabulary == ():
+            object.__setattr__(self, "vocabulary", words_of(self.sentences))
         self._check_vocabulary()
         self._check_instructions()
         self._check_layout()
@@ -192,12 +191,6 @@ class Experiment:
     def sentences(self) -> tuple[str, ...]:
         """The sentences of the Instructional Set, in order."""
         return tuple(instruction.text for instruction in self.instructions)
-
-    @property
-    def targets(self) -> tuple[int, ...]:
-        """For each instruction, the index in `objects` of the one that it names."""
-        names = [thing.name for thing in self.objects]
-        return tuple(names.index(i.target) for i in self.instructions)
 
     def _check_vocabulary(self) -> None:
         _check_tuple("vocabulary", self.vocabulary, str)
@@ -223,30 +216,36 @@ class Experiment:
             raise ExperimentError("instructions: got none, expected at least one")
         said: dict[tuple[int, ...], Instruction] = {}
         for instruction in self.instructions:
-            _check_choice("instruction target", instruction.target, names)
-            _check_type("instruction text", instruction.text, str)
+            self._check_refs(instruction)
             tokens = tuple(tokenize(instruction.text, self.vocabulary))
             if not tokens:
                 raise ExperimentError(
                     f"instruction text: got {instruction.text!r}, an empty sentence"
                 )
             other = said.setdefault(tokens, instruction)
-            if other.target != instruction.target:
+            if other.goal != instruction.goal:
                 raise ExperimentError(
                     f"instructions: got {other.text!r} and {instruction.text!r}, which "
                     f"are the same to the vocabulary {self.vocabulary}; expected it to "
-                    "have the words that tell their objects apart"
+                    "have the words that tell their goals apart"
+                )
+
+    def _check_refs(self, instruction: Instruction) -> None:
+        """Raise unless each reference fits one object, as far as the layout says."""
+        layout = _layout(self.objects)
+        for ref in instruction.goal.refs:
+            fits = int(ref.resolve(layout).sum())
+            unknown = self.shuffled and ref.where is not None  # told at each reset
+            if fits != 1 and not unknown:
+                names = ", ".join(thing.name for thing in self.objects)
+                raise ExperimentError(
+                    f"instruction {instruction.text!r}: got {ref}, which fits {fits} "
+                    f"of the objects, expected exactly one of: {names}"
                 )
 
     def _check_layout(self) -> None:
         slack = self.jitter.position * math.sqrt(2)
         for thing in self.objects:
-            reach = min(math.dist(thing.position, s) for s in SHOULDERS)
-            if reach + slack > REACH + 1e-9:
-                raise ExperimentError(
-                    f"{thing.name} at {thing.position}: {reach + slack:.3f} m from the "
-                    f"nearest shoulder with jitter, expected at most {REACH} m"
-                )
             margin = OBJECT_SIZE / math.sqrt(2) + self.jitter.position
             for value, (low, high) in zip(thing.position, TABLE, strict=True):
                 if not low + margin <= value <= high - margin:
@@ -271,14 +270,52 @@ def tokenize(sentence: str, vocabulary: tuple[str, ...] = VOCABULARY) -> list[in
         sentence: Any text; case does not matter, unknown words become `<unk>`.
         vocabulary: The known tokens; an id is a place in it.
     """
-    words = re.findall(r"[^\W_]+|\.", sentence.lower())
     ids = {word: index for index, word in enumerate(vocabulary)}
-    return [ids.get(word, UNK) for word in words]
+    return [ids.get(word, UNK) for word in split_words(sentence)]
+
+
+def split_words(sentence: str) -> list[str]:
+    """Return the words and full stops of a sentence, in lower case.
+
+    Letters of any script count, with the marks that belong to them.
+    """
+    text = unicodedata.normalize("NFC", sentence.lower()).replace(".", " . ")
+    parts = (
+        c if c.isalnum() or c == "." or unicodedata.category(c)[0] == "M" else " "
+        for c in text
+    )
+    return "".join(parts).split()
+
+
+def words_of(sentences: Iterable[str]) -> tuple[str, ...]:
+    """Return the vocabulary of the sentences: `<pad>`, `<unk>` and their words."""
+    words = (word for text in sentences for word in split_words(text))
+    return (*VOCABULARY[:2], *dict.fromkeys(words))
 
 
 def touch_instructions(objects: Iterable[TouchObject]) -> tuple[Instruction, ...]:
     """Return "Touch the <name>." for each object (the paper's only template)."""
-    return tuple(Instruction(f"Touch the {o.name}.", o.name) for o in objects)
+    return tuple(
+        Instruction(f"Touch the {o.name}.", Touch(Ref(o.color, o.shape)))
+        for o in objects
+    )
+
+
+def _layout(objects: Iterable[TouchObject]) -> Snapshot:
+    """Return a snapshot that knows only what lies where [1, ...]."""
+    things = tuple(objects)
+    poses = torch.tensor([[*o.position, 0, 1, 0, 0, 0] for o in things]).float()[None]
+    none = torch.zeros(1, 0, len(things))
+    return Snapshot(
+        contact=none.bool(),
+        fingertip=torch.zeros(1, 0, 3),
+        pose=poses,
+        start=poses,
+        velocity=torch.zeros(1, len(things), 3),
+        color=torch.tensor([[list(COLORS).index(o.color) for o in things]]),
+        shape=torch.tensor([[SHAPES.index(o.shape) for o in things]]),
+        stage=torch.zeros(1, dtype=torch.int64),
+    )
 
 
 _CATALOG: dict[str, Experiment] = {}

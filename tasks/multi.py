@@ -1,6 +1,6 @@
 """Experiment II: three objects in a line, three instructions (paper, Sec. IV-B)."""
 
-from ir_maniskill.experiment import Experiment, touch_instructions
+from ir_maniskill.experiment import VOCABULARY, Experiment, touch_instructions
 from ir_maniskill.registration import register
 from ir_maniskill.tasks.layouts import line
 
@@ -14,6 +14,7 @@ def multi(task_id: str, shape: str) -> Experiment:
         instructions=touch_instructions(objects),
         reward="binary",
         senses=("vision",),
+        vocabulary=VOCABULARY,
     )
 
 

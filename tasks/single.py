@@ -1,6 +1,6 @@
 """Experiment I: three objects in a line, one instruction (paper, Sec. IV-A)."""
 
-from ir_maniskill.experiment import Experiment, touch_instructions
+from ir_maniskill.experiment import VOCABULARY, Experiment, touch_instructions
 from ir_maniskill.registration import register
 from ir_maniskill.tasks.layouts import line
 
@@ -14,6 +14,7 @@ def single(task_id: str, shape: str) -> Experiment:
         instructions=touch_instructions(objects[:1]),
         reward="binary",
         senses=("vision",),
+        vocabulary=VOCABULARY,
     )
 
 

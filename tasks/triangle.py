@@ -1,6 +1,6 @@
 """Experiment III: triangle, proprioception, reward per finger (paper, Sec. IV-C)."""
 
-from ir_maniskill.experiment import Experiment, touch_instructions
+from ir_maniskill.experiment import VOCABULARY, Experiment, touch_instructions
 from ir_maniskill.registration import register
 from ir_maniskill.tasks import layouts
 
@@ -15,6 +15,7 @@ def triangle(task_id: str, shape: str) -> Experiment:
         reward="per_finger",
         wrong_penalty=0.1,
         senses=("vision", "proprioception", "touch"),
+        vocabulary=VOCABULARY,
     )
 
 

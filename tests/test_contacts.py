@@ -1,15 +1,14 @@
-"""Contact forces [N, F, C] from either backend, with stand-ins for PhysX."""
+"""Touches [N, F, C] from either backend, with stand-ins for PhysX."""
 
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 import torch
 
 from ir_maniskill.environment.contacts import (
-    CpuContactQuery,
-    GpuContactQuery,
-    contact_query,
+    CpuTouchSensor,
+    GpuTouchSensor,
+    touch_sensor,
 )
 
 TIMESTEP = 0.01
@@ -26,27 +25,33 @@ def touch(first: str, second: str, *impulses: tuple) -> SimpleNamespace:
     return SimpleNamespace(bodies=(first, second), points=points)
 
 
-def test_cpu_query_sums_a_fingers_links_in_either_order() -> None:
+def test_cpu_sensor_adds_up_a_fingers_links_and_keeps_each_substeps_touches() -> None:
     contacts = [
-        touch("tip", "red", (0.003, 0, 0.004)),
-        touch("red", "base", (0, 0, 0.001), (0, 0, 0.001)),
+        touch("tip", "red", (0.00003, 0, 0.00004)),
+        touch("red", "base", (0, 0, 0.00003), (0, 0, 0.00003)),  # 0.011 N together
         touch("tip", "table", (0, 0, 9.0)),
         touch("red", "table", (0, 0, 9.0)),
-        touch("thumb", "blue", (0, 0, 0)),
+        touch("thumb", "blue", (0, 0, 0.00009)),  # 0.009 N: too light
     ]
     system = SimpleNamespace(get_contacts=lambda: contacts, timestep=TIMESTEP)
     scene = SimpleNamespace(px=system, gpu_sim_enabled=False)
     fingers = [[part("base"), part("tip")], [part("thumb")]]
-    query = contact_query(scene, fingers, [part("blue"), part("red")])
-    assert isinstance(query, CpuContactQuery)
-    expected = torch.tensor([[[0.0, 0.7], [0.0, 0.0]]])
-    torch.testing.assert_close(query(), expected)
+    sensor = touch_sensor(scene, fingers, [part("blue"), part("red")])
+    assert isinstance(sensor, CpuTouchSensor)
+    sensor.update()
+    assert sensor.read().tolist() == [[[False, True], [False, False]]]
+    contacts[:] = [touch("thumb", "blue", (0, 0, 0.002))]
+    sensor.update()
+    assert sensor.read().tolist() == [[[False, True], [True, False]]]
+    sensor.clear()
+    assert not sensor.read().any()
 
 
 class GpuSystem:
-    """A stand-in that gives pair k the impulse (0, 0, k) and checks the order."""
+    """A stand-in that gives pair k the impulse (0, 0, k) if k is chosen."""
 
     timestep = TIMESTEP
+    chosen: tuple[int, ...] = ()
 
     def gpu_create_contact_pair_impulse_query(self, pairs: list) -> SimpleNamespace:
         self.pairs = pairs
@@ -56,22 +61,25 @@ class GpuSystem:
         )
 
     def gpu_query_contact_pair_impulses(self, query: object) -> None:
-        self.impulses[:, 2] = torch.arange(len(self.pairs))
+        self.impulses[:, 2] = torch.tensor(
+            [float(k in self.chosen) for k in range(len(self.pairs))]
+        )
 
 
-def test_gpu_query_puts_every_pair_where_it_belongs() -> None:
+def test_gpu_sensor_puts_every_pair_where_it_belongs() -> None:
     system = GpuSystem()
-    scene = SimpleNamespace(px=system, gpu_sim_enabled=True, num_envs=2)
+    scene = SimpleNamespace(px=system, gpu_sim_enabled=True, num_envs=2, device="cpu")
     fingers = [[part("a0", "a1"), part("b0", "b1")], [part("c0", "c1")]]
     objects = [part("x0", "x1"), part("y0", "y1")]
-    query = contact_query(scene, fingers, objects)
-    assert isinstance(query, GpuContactQuery)
-    force = query()
-    assert force.shape == (2, 2, 2)
-    at = {pair: k for k, pair in enumerate(system.pairs)}
-    for env in range(2):
-        for c, thing in enumerate("xy"):
-            first = sum(at[f"{link}{env}", f"{thing}{env}"] for link in "ab")
-            second = at[f"c{env}", f"{thing}{env}"]
-            expected = [first / TIMESTEP, second / TIMESTEP]
-            assert force[env, :, c].tolist() == pytest.approx(expected)
+    sensor = touch_sensor(scene, fingers, objects)
+    assert isinstance(sensor, GpuTouchSensor)
+    for k, (link, thing) in enumerate(system.pairs):
+        system.chosen = (k,)
+        sensor.clear()
+        sensor.update()
+        place = (int(link[1]), int(link[0] == "c"), int(thing[0] == "y"))
+        assert sensor.read().nonzero().tolist() == [list(place)]
+    system.chosen = tuple(range(len(system.pairs)))
+    sensor.update()
+    sensor.clear(torch.tensor([1]))
+    assert sensor.read().flatten(1).all(dim=1).tolist() == [True, False]

@@ -12,12 +12,12 @@ import pytest
 import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from scenes import HANDS
 
 import ir_maniskill
 from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.instructional_set import InstructionalSet
 from ir_maniskill.experiment import (
-    COLORS,
     VOCABULARY,
     Experiment,
     ExperimentError,
@@ -27,6 +27,7 @@ from ir_maniskill.experiment import (
     UnknownExperimentError,
     touch_instructions,
 )
+from ir_maniskill.goals import COLORS, Ref, Touch, left_of, other_than
 
 IDS = (
     "NaoTouchCubeMulti-v1",
@@ -40,6 +41,7 @@ IDS = (
 )
 BLUE = TouchObject("blue", (0.20, 0.0))
 RED = TouchObject("red", (0.20, 0.10))
+SOUND, PINK, CUBE = Touch(Ref("red")), Touch(Ref("purple")), Touch(Ref(shape="cube"))
 
 
 def make(**changes: object) -> Experiment:
@@ -100,8 +102,9 @@ def test_an_id_of_another_package_is_taken(task_id: str) -> None:
         ({"episode_steps": 0}, "episode_steps: got 0"),
         ({"senses": ("smell",)}, "sense: got 'smell'"),
         ({"instructions": ()}, "instructions: got none"),
-        ({"instructions": (Instruction("Go.", "sky"),)}, "target: got 'sky'"),
-        ({"instructions": (Instruction(" ", "red cube"),)}, "an empty sentence"),
+        ({"instructions": (Instruction("Go.", PINK),)}, "which fits 0 of the objects"),
+        ({"instructions": (Instruction("Go.", CUBE),)}, "which fits 2 of the objects"),
+        ({"instructions": (Instruction(" ", SOUND),)}, "an empty sentence"),
         ({"objects": ()}, "at least one"),
         ({"objects": (BLUE, BLUE)}, "no two alike"),
         ({"vocabulary": ("touch", "the")}, "vocabulary: got"),
@@ -109,8 +112,7 @@ def test_an_id_of_another_package_is_taken(task_id: str) -> None:
         ({"vocabulary": (*VOCABULARY, "cube")}, "got 'cube', .* no two alike"),
         ({"vocabulary": "touch"}, r"vocabulary: got 'touch', expected \(str, ...\)"),
         ({"objects": [BLUE]}, r"expected \(TouchObject, ...\)"),
-        ({"instructions": (Instruction("?!", "red cube"),)}, "'\\?!', an empty"),
-        ({"instructions": (Instruction(3, "red cube"),)}, "got 3, expected a str"),
+        ({"instructions": (Instruction("?!", SOUND),)}, "'\\?!', an empty"),
         ({"shuffled": "no"}, "shuffled: got 'no', expected a bool"),
         ({"jitter": 0.01}, "jitter: got 0.01, expected a Jitter"),
         ({"wrong_penalty": "1"}, "wrong_penalty: got '1', expected 0 to 10"),
@@ -125,7 +127,6 @@ def test_malformed_experiments_are_refused(changes: dict, message: str) -> None:
 @pytest.mark.parametrize(
     ("position", "message"),
     [
-        ((0.38, 0.0), "m from the nearest shoulder"),
         ((0.11, 0.0), "not wholly on the table"),
         ((0.20, 0.05), "may overlap"),
         ((float("nan"), 0.0), "two finite numbers"),
@@ -168,12 +169,10 @@ def worst(wherever: list[list[Place]]) -> dict[str, float]:
         wherever: For each object, the places where it may come to lie.
     """
     anywhere = list(itertools.chain(*wherever))
-    arms = [min(math.dist(p, (0, s)) for s in (0.098, -0.098)) for p in anywhere]
     edges = [min(x - 0.10, 0.40 - x, 0.34 - abs(y)) for x, y in anywhere]
     pairs = itertools.combinations(wherever, 2)
     gaps = [math.dist(*places) for pair in pairs for places in itertools.product(*pair)]
     return {
-        "from the nearest shoulder": 0.255 - max(arms),
         "not wholly on the table": min(edges) - RADIUS,
         "may overlap": min(gaps, default=1.0) - 2 * RADIUS,
     }
@@ -182,7 +181,7 @@ def worst(wherever: list[list[Place]]) -> dict[str, float]:
 def lay(places: list[Place], jitter: float) -> None:
     """Make an experiment with objects there; raises what `Experiment` does."""
     objects = tuple(map(TouchObject, COLORS, places))
-    orders = (Instruction("Go.", objects[0].name),)
+    orders = (Instruction("Go.", Touch(Ref(objects[0].color))),)
     make(objects=objects, instructions=orders, jitter=Jitter(position=jitter))
 
 
@@ -212,8 +211,10 @@ def test_no_jitter_spoils_what_is_accepted(places: list[Place], jitter: float) -
 
 def test_sentences_that_the_learner_cannot_tell_apart_are_refused() -> None:
     things = (TouchObject("purple", (0.2, 0.0)), TouchObject("orange", (0.2, 0.1)))
-    with pytest.raises(ExperimentError, match="the words that tell their objects"):
-        Experiment("Fruit-v1", things, touch_instructions(things))
+    with pytest.raises(ExperimentError, match="the words that tell their goals"):
+        Experiment(
+            "Fruit-v1", things, touch_instructions(things), vocabulary=VOCABULARY
+        )
     Experiment(
         "Fruit-v1",
         things,
@@ -249,19 +250,37 @@ def test_whatever_a_field_is_set_to_it_works_or_is_refused(
         assert isinstance(made.episode_steps, int) and 1 <= made.episode_steps <= 10**4
         assert 0 <= made.wrong_penalty <= 10
         assert isinstance(made.shuffled, bool)
-        InstructionalSet(made, torch.device("cpu"))
+        InstructionalSet(made, HANDS, torch.device("cpu"))
 
 
 @given(st.lists(st.tuples(st.text(), st.booleans()), min_size=1, max_size=4))
-def test_accepted_sentences_have_tokens_that_say_which_object(
+def test_accepted_sentences_have_tokens_that_say_which_goal(
     said: list[tuple[str, bool]],
 ) -> None:
-    orders = tuple(Instruction(t, (BLUE if b else RED).name) for t, b in said)
+    orders = tuple(Instruction(t, Touch(Ref("blue" if b else "red"))) for t, b in said)
     try:
-        made = InstructionalSet(make(instructions=orders), torch.device("cpu"))
+        experiment = make(instructions=orders, vocabulary=VOCABULARY)
     except ExperimentError:
         return
+    made = InstructionalSet(experiment, HANDS, torch.device("cpu"))
     assert (made.tokens[:, 0] > 0).all()
-    meanings = dict(zip(map(tuple, made.tokens.tolist()), made.targets, strict=True))
-    for row, target in zip(made.tokens.tolist(), made.targets, strict=True):
-        assert meanings[tuple(row)] == target
+    rows = list(map(tuple, made.tokens.tolist()))
+    meanings = dict(zip(rows, orders, strict=True))
+    for row, order in zip(rows, orders, strict=True):
+        assert meanings[row].goal == order.goal
+
+
+@pytest.mark.parametrize(("text", "goal"), [(3, SOUND), ("Go.", "red cube")])
+def test_instructions_of_other_types_are_refused(text: object, goal: object) -> None:
+    with pytest.raises(ExperimentError, match="got (3|'red cube'), expected a (str|G)"):
+        Instruction(text, goal)
+
+
+def test_a_relation_in_shuffled_places_is_left_to_the_reset() -> None:
+    left = Instruction("Touch the left one.", Touch(Ref(where=left_of(Ref("blue")))))
+    make(instructions=(left,))
+    green = TouchObject("green", (0.20, -0.10))
+    two = Instruction("Touch that.", Touch(Ref(where=other_than(Ref("blue")))))
+    with pytest.raises(ExperimentError, match="fits 2 of the objects"):
+        make(objects=(BLUE, RED, green), instructions=(two,))
+    make(objects=(BLUE, RED, green), instructions=(two,), shuffled=True)

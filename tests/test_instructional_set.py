@@ -1,10 +1,13 @@
 """Sentences become the tokens of the paper's vocabulary."""
 
+import dataclasses
 from random import Random
 
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scenes import HANDS
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.instructional_set import InstructionalSet
@@ -15,8 +18,10 @@ from ir_maniskill.experiment import (
     Experiment,
     Instruction,
     TouchObject,
+    split_words,
     tokenize,
 )
+from ir_maniskill.goals import Ref, Touch
 
 CPU = torch.device("cpu")
 
@@ -51,23 +56,40 @@ def test_tokens_name_their_words_in_any_case_and_spacing(
     assert [VOCABULARY[t] for t in tokenize(text)] == words
 
 
-def test_shorter_sentences_are_padded_and_targets_are_found() -> None:
+def test_shorter_sentences_are_padded_and_words_are_numbered_as_they_come() -> None:
     blue, red = TouchObject("blue", (0.2, 0.0)), TouchObject("red", (0.2, 0.1))
     both = Experiment(
         "Pad-v1",
         (blue, red),
         (
-            Instruction("Touch the red cube.", "red cube"),
-            Instruction("Blue", blue.name),
+            Instruction("Touch the red cube.", Touch(Ref("red"))),
+            Instruction("Blue, the...", Touch(Ref("blue"))),
         ),
     )
-    instructions = InstructionalSet(both, CPU)
-    assert instructions.tokens.tolist() == [[3, 4, 6, 8, 2], [5, PAD, PAD, PAD, PAD]]
-    assert instructions.targets.tolist() == [1, 0]
+    instructions = InstructionalSet(both, HANDS, CPU)
+    assert both.vocabulary[2:] == ("touch", "the", "red", "cube", ".", "blue")
+    assert instructions.tokens.tolist() == [[2, 3, 4, 5, 6], [7, 3, 6, 6, 6]]
+    short = Experiment("Pad-v1", (blue,), (Instruction("Blue", Touch(Ref("blue"))),))
+    both = dataclasses.replace(
+        both, instructions=both.instructions[:1] + short.instructions
+    )
+    assert InstructionalSet(both, HANDS, CPU).tokens[1].tolist() == [7, *[PAD] * 4]
+
+
+@pytest.mark.parametrize(
+    ("sentence", "words"),
+    [
+        ("Wu\u0308rfel", ["w\u00fcrfel"]),
+        ("\u0928\u0940\u0932\u093e!", ["\u0928\u0940\u0932\u093e"]),
+        ("l\u2019objet_bleu.", ["l", "objet", "bleu", "."]),
+    ],
+)
+def test_words_of_any_script_stay_whole(sentence: str, words: list[str]) -> None:
+    assert split_words(sentence) == words
 
 
 def test_uniform_numbers_pick_every_instruction_equally() -> None:
-    instructions = InstructionalSet(catalog.get("NaoTouchCubeMulti-v1"), CPU)
+    instructions = InstructionalSet(catalog.get("NaoTouchCubeMulti-v1"), HANDS, CPU)
     picks = instructions.pick(torch.tensor([0.0, 0.33, 0.34, 0.66, 0.67, 1.0]))
     assert picks.tolist() == [0, 0, 1, 1, 2, 2]
 
@@ -79,7 +101,7 @@ def test_sentences_are_read_word_by_word(first: str, second: str) -> None:
 
 @given(st.lists(st.floats(0, 1, width=32), min_size=1))
 def test_any_uniform_number_picks_an_instruction(numbers: list[float]) -> None:
-    instructions = InstructionalSet(catalog.get("NaoTouchCubeMulti-v1"), CPU)
+    instructions = InstructionalSet(catalog.get("NaoTouchCubeMulti-v1"), HANDS, CPU)
     ordered = instructions.pick(torch.tensor(sorted(numbers)))
     assert ((ordered >= 0) & (ordered < len(instructions))).all()
     assert (ordered.diff() >= 0).all()

@@ -24,6 +24,7 @@ from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.robots.nao import JOINTS
 from ir_maniskill.environment.touch_env import TouchEnv
 from ir_maniskill.experiment import Jitter
+from ir_maniskill.goals import Ref, Touch
 
 IDS = ir_maniskill.available()[:8]
 DELTA = "pd_joint_target_delta_pos"
@@ -113,11 +114,17 @@ def test_the_sentence_its_tokens_and_its_object_belong_together(env: gym.Env) ->
         obs, _ = env.reset(options={"instruction": index})
         assert env.unwrapped.get_language_instruction() == [instruction.text]
         chosen = obs["extra"]["target_object"][0].argmax().item()
-        assert env.unwrapped.experiment.objects[chosen].name == instruction.target
+        thing = env.unwrapped.experiment.objects[chosen]
+        assert instruction.goal == Touch(Ref(thing.color, thing.shape))
+        again, _ = env.reset(options={"instruction": instruction.text})
+        assert torch.equal(again["extra"]["instruction"], obs["extra"]["instruction"])
         words = [catalog.VOCABULARY[token] for token in obs["extra"]["instruction"][0]]
         assert words == instruction.text.lower().replace(".", " .").split()
-    with pytest.raises(ValueError, match="'instruction': got 3, expected indices 0 to"):
-        env.reset(options={"instruction": 3})
+    for wrong in (3, True, 1.5, "Touch the sky.", [0.0], float):
+        with pytest.raises(
+            ValueError, match="'instruction': got .* expected s"
+        ):
+            env.reset(options={"instruction": wrong})
     with pytest.raises(ValueError, match=r"got \[0, 0\].* or one for each of 1: "):
         env.reset(options={"instruction": [0, 0]})
 
@@ -177,7 +184,7 @@ def test_observation_modes(mode: str) -> None:
     env = gym.make("NaoTouchButtonMulti-v1", obs_mode=mode, sensor_configs=cameras)
     obs, _ = env.reset(seed=0)
     if mode == "state":
-        assert obs.shape == (1, 26 * 3 + 6 + 5 + 9 + 18 + 3 + 1)
+        assert obs.shape == (1, 26 * 3 + 6 + 5 + 9 + 18 + 3 + 6 + 1 + 1)
     else:
         data = obs.get("sensor_data", {}).get("top_camera", {})
         assert set(data) == {"rgb": {"rgb"}, "rgbd": {"rgb", "depth"}}.get(mode, set())
@@ -192,6 +199,36 @@ def test_pictures_that_a_shader_pack_cannot_draw_are_refused() -> None:
             obs_mode="rgbd",
             sensor_configs={"width": 32, "height": 64, "shader_pack": "unlit"},
         )
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"num_envs": 2, "sim_backend": "physx_cpu"}, "got 2, .*make_vec"),
+        ({"experiment": None}, "experiment: got None, expected an Experiment or its"),
+        ({"reward_weights": {"hold": -1}}, "reward_weights: got hold=-1"),
+    ],
+)
+def test_arguments_that_cannot_work_are_refused(wrong: dict, message: str) -> None:
+    given = {"experiment": "NaoTouchCubeSingle-v1", "render_backend": None}
+    with pytest.raises(ValueError, match=message):
+        TouchEnv(**given | wrong)
+
+
+def test_actions_of_all_kinds_are_taken_and_those_not_finite_refused(
+    fixed: gym.Env,
+) -> None:
+    fixed.reset(seed=0)
+    for action in (
+        torch.zeros(26, requires_grad=True),
+        np.zeros(26)[::-1],
+        torch.zeros(1, 26, dtype=torch.bfloat16),
+    ):
+        obs = fixed.step(action)[0]
+        assert not any(leaf.requires_grad for leaf in leaves(obs).values())
+    for bad in (np.nan, np.inf):
+        with pytest.raises(ValueError, match="expected finite numbers"):
+            fixed.step(np.full(26, bad, np.float32))
 
 
 def test_unknown_ids_and_modes_are_refused() -> None:
@@ -301,6 +338,43 @@ def test_a_reset_forgets_the_touches_of_the_last_episode(fixed: gym.Env) -> None
     assert last["elapsed_steps"].tolist() == [12]
 
 
+def test_asking_again_changes_nothing_and_a_state_has_no_touches(
+    fixed: gym.Env,
+) -> None:
+    base = fixed.unwrapped
+    fixed.reset(seed=0, options={"instruction": GREEN})
+    clean = base.get_state_dict()
+    *_, pressed = hold(fixed, **PRESS)
+    assert pressed["wrong_once"].item()
+    base.set_state_dict(clean)  # PhysX still holds the contacts of the last step
+    for _ in range(2):
+        base.get_obs()
+        info = base.get_info()
+        assert not info["contact"].any()
+        assert not info["wrong_once"].any()
+    *_, again = hold(fixed, **PRESS)
+    assert again["wrong_once"].item()
+    assert base.get_info()["wrong_fingers"] == again["wrong_fingers"]
+
+
+def test_a_touch_between_two_steps_counts(fixed: gym.Env) -> None:
+    base = fixed.unwrapped
+    fixed.reset(seed=0, options={"instruction": RED})
+    hold(fixed, **PRESS)
+    seen, update = [], base._touch.update
+
+    def watch() -> None:
+        if not seen:  # only the first substep finds contacts
+            update()
+        seen.append(base._touch.read().any().item())
+
+    base._touch.update = watch
+    *_, info = hold(fixed, 1, **PRESS)
+    base._touch.update = update
+    assert seen == [True] * 5
+    assert info["success"].item()
+
+
 def test_dense_reward_grows_as_the_hand_comes_near() -> None:
     env = gym.make(
         "NaoTouchCubeTriangle-v1",
@@ -322,7 +396,7 @@ def test_the_named_object_costs_by_its_own_speed() -> None:
         obs_mode="none",
         reward_mode="dense",
         render_backend="none",
-        dense_weights={"push": 2.0},
+        reward_weights={"speed": 2.0},
     ).unwrapped
     env.reset(seed=0, options={"instruction": RED})
 

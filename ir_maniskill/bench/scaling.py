@@ -19,7 +19,8 @@ from ir_maniskill.bench.run import SHADER
 from ir_maniskill.bench.simulation import OURS
 from ir_maniskill.bench.timing import timed
 from ir_maniskill.environment.process_vector import ProcessVectorEnv
-from ir_maniskill.experiment import COLORS, Experiment, Instruction, Jitter, TouchObject
+from ir_maniskill.experiment import Experiment, Instruction, Jitter, TouchObject
+from ir_maniskill.goals import COLORS, Ref, Touch
 
 ENVS = (1, 2, 4, 8, 16)
 SIZES = ((64, 32), (128, 64), (128, 128), (256, 128), (512, 256))
@@ -93,7 +94,7 @@ def with_objects(count: int) -> Experiment:
     colors = list(COLORS)[:count]
     places = [(x, y) for x in (0.17, 0.23) for y in (-0.08, 0.0, 0.08)]
     cubes = tuple(map(TouchObject, colors, places))
-    sentence = Instruction("Touch the blue cube.", cubes[0].name)
+    sentence = Instruction("Touch the blue cube.", Touch(Ref("blue")))
     base = catalog.get(OURS)
     name = f"Cubes{count}-v1"
     return replace(

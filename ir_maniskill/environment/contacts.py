@@ -1,41 +1,41 @@
-"""Contact forces between fingers and objects: all that differs between backends.
+"""Which finger touched which object: what differs between CPU and GPU physics.
 
-Both queries answer with forces [N, F, C] in newtons. Legend: N envs, F fingers,
-C objects. The CPU one walks the contact list once; the GPU one asks for all pairs in
-one impulse query.
+A sensor is updated after every physics substep, so that a touch between two control
+steps counts. The CPU one walks the contact list; the GPU one asks for all pairs in one
+impulse query. Legend: N envs, F fingers, C objects.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Sequence
 
-import numpy as np
 import torch
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.structs import Actor, Link
 from torch import Tensor
 
-ContactQuery = Callable[[], Tensor]
-"""Returns the force of every finger on every object [N, F, C] [N]."""
+TOUCH_FORCE = 0.01
+"""Force from which a contact counts as a touch [N]."""
 
 
-def contact_query(
+def touch_sensor(
     scene: ManiSkillScene,
     fingers: Sequence[Sequence[Link]],
     objects: Sequence[Actor],
-) -> ContactQuery:
-    """Return the query for the backend that `scene` runs on.
+) -> CpuTouchSensor | GpuTouchSensor:
+    """Return the sensor for the backend that `scene` runs on.
 
     Args:
         scene: The ManiSkill scene, set up.
         fingers: The links of each finger.
         objects: What they may touch.
     """
-    kind = GpuContactQuery if scene.gpu_sim_enabled else CpuContactQuery
+    kind = GpuTouchSensor if scene.gpu_sim_enabled else CpuTouchSensor
     return kind(scene, fingers, objects)
 
 
-class CpuContactQuery:
+class CpuTouchSensor:
     """Reads the contact list of PhysX on the CPU, where N is 1."""
 
     def __init__(
@@ -53,20 +53,32 @@ class CpuContactQuery:
                     pair = link._bodies[0], actor._bodies[0]
                     self._place[pair] = self._place[pair[::-1]] = (0, f, c)
         self._shape = (1, len(fingers), len(objects))
+        self._touched: set[tuple[int, int, int]] = set()
 
-    def __call__(self) -> Tensor:
-        """Return the forces of the last physics step [1, F, C] [N]."""
-        force = np.zeros(self._shape, dtype=np.float32)
+    def clear(self, env_idx: Tensor | None = None) -> None:
+        """Forget all touches so far."""
+        self._touched.clear()
+
+    def update(self) -> None:
+        """Add the touches of the last physics step."""
+        impulses: dict[tuple[int, int, int], float] = {}
         for contact in self._system.get_contacts():
             place = self._place.get(tuple(contact.bodies))
-            if place is not None:
+            if place is not None and place not in self._touched:
                 impulse = sum(point.impulse for point in contact.points)
-                force[place] += np.linalg.norm(impulse)
-        force /= self._system.timestep
-        return torch.from_numpy(force)
+                impulses[place] = impulses.get(place, 0.0) + math.hypot(*impulse)
+        least = TOUCH_FORCE * self._system.timestep  # [N s]
+        self._touched.update(p for p, impulse in impulses.items() if impulse > least)
+
+    def read(self) -> Tensor:
+        """Return which finger has touched which object since `clear` [1, F, C] bool."""
+        contact = torch.zeros(self._shape, dtype=torch.bool)
+        for place in self._touched:
+            contact[place] = True
+        return contact
 
 
-class GpuContactQuery:
+class GpuTouchSensor:
     """Asks PhysX on the GPU for the impulses of all pairs at once.
 
     Not yet run on a GPU: tested with a stand-in for the physics system.
@@ -90,11 +102,23 @@ class GpuContactQuery:
         self._query = self._system.gpu_create_contact_pair_impulse_query(pairs)
         self._shape = (len(links), len(objects), scene.num_envs, 3)
         self._sizes = [len(finger) for finger in fingers]
+        shape = (scene.num_envs, len(fingers), len(objects))
+        self._touched = torch.zeros(shape, dtype=torch.bool, device=scene.device)
 
-    def __call__(self) -> Tensor:
-        """Return the forces of the last physics step [N, F, C] [N]."""
+    def clear(self, env_idx: Tensor | None = None) -> None:
+        """Forget all touches so far, of the envs given [b] or of all."""
+        rows = slice(None) if env_idx is None else env_idx
+        self._touched[rows] = False
+
+    def update(self) -> None:
+        """Add the touches of the last physics step."""
         self._system.gpu_query_contact_pair_impulses(self._query)
         impulse = self._query.cuda_impulses.torch().view(self._shape)
-        force = impulse.norm(dim=-1) / self._system.timestep  # [links, C, N]
-        per_finger = [part.sum(0) for part in force.split(self._sizes)]  # F x [C, N]
-        return torch.stack(per_finger).permute(2, 0, 1)  # [N, F, C]
+        size = impulse.norm(dim=-1)  # [links, C, N]
+        fingers = [part.sum(0) for part in size.split(self._sizes)]  # F x [C, N]
+        least = TOUCH_FORCE * self._system.timestep  # [N s]
+        self._touched |= torch.stack(fingers).permute(2, 0, 1) > least
+
+    def read(self) -> Tensor:
+        """Return which finger has touched which object since `clear` [N, F, C] bool."""
+        return self._touched.clone()

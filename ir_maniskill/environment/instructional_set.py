@@ -1,11 +1,26 @@
-"""Instructional Set: the sentences i_t, their tokens, what they name (Sec. III-A)."""
+"""Instructional Set: sentences i_t, their tokens and their goals (Sec. III-A).
+
+Legend: I instructions, N envs, L tokens, F fingers, C objects.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from numbers import Real
+from types import SimpleNamespace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ir_maniskill.experiment import PAD, Experiment, tokenize
+from ir_maniskill.goals import DIRECTIONS, Goal, GoalError, Measure, Ref
+from ir_maniskill.snapshot import Snapshot
+
+Deal = Callable[[Tensor, Tensor, Snapshot], Any]
+"""Gives each scene its value of one field: rows [N] of the table, which rows count
+[N] bool, scenes."""
 
 
 class InstructionalSet:
@@ -14,20 +29,29 @@ class InstructionalSet:
     Attributes:
         sentences: The I sentences.
         tokens: Token ids, padded with 0 to the longest sentence [I, L] int64.
-        targets: Index of the object that each sentence names [I] int64.
-        named: The same, one-hot [I, C] bool.
+        goals: The I goals, ready to be measured.
     """
 
-    def __init__(self, experiment: Experiment, device: torch.device) -> None:
-        """Tokenize the sentences of `experiment` onto `device`."""
+    def __init__(
+        self, experiment: Experiment, hands: Mapping[str, Tensor], device: torch.device
+    ) -> None:
+        """Put the sentences and goals of `experiment` onto `device`.
+
+        Args:
+            experiment: Whose instructions.
+            hands: Which fingers belong to each of the robot's hands [F] bool.
+            device: Of all tensors.
+
+        Raises:
+            GoalError: A goal asks for a hand that the robot does not have.
+        """
         self.sentences = experiment.sentences
         rows = [tokenize(s, experiment.vocabulary) for s in self.sentences]
         length = max(map(len, rows))
         padded = [row + [PAD] * (length - len(row)) for row in rows]
         self.tokens = torch.tensor(padded, device=device)  # [I, L]
-        self.targets = torch.tensor(experiment.targets, device=device)  # [I]
-        one_hot = torch.eye(len(experiment.objects), dtype=torch.bool, device=device)
-        self.named = one_hot[self.targets]  # [I, C]
+        goals = [instruction.goal for instruction in experiment.instructions]
+        self.goals = GoalTable(goals, hands, device)
 
     def __len__(self) -> int:
         """Return the number of instructions I."""
@@ -36,3 +60,135 @@ class InstructionalSet:
     def pick(self, uniform: Tensor) -> Tensor:
         """Map uniform numbers in [0, 1) to instruction indices [N] int64."""
         return (uniform * len(self)).long().clamp(max=len(self) - 1)
+
+
+@dataclass(frozen=True)
+class GoalBatch:
+    """One goal for each of N scenes; kinds may be mixed."""
+
+    parts: tuple[tuple[Tensor, type[Goal], SimpleNamespace], ...]
+    """For each kind: where it is asked [N] bool, the kind, its fields stacked."""
+
+    def measure(self, scene: Snapshot) -> Measure:
+        """Measure the goal of each scene."""
+        (_, kind, asked), *others = self.parts
+        measure = kind.measure(scene, asked)
+        for chosen, kind, asked in others:
+            measure = Measure.where(chosen, kind.measure(scene, asked), measure)
+        return measure
+
+
+class GoalTable:
+    """Goals as columns of tensors, to be dealt to any batch of scenes."""
+
+    def __init__(
+        self, goals: Sequence[Goal], hands: Mapping[str, Tensor], device: torch.device
+    ) -> None:
+        """Sort the goals by kind and stack their fields.
+
+        Args:
+            goals: The goals.
+            hands: Which fingers belong to each hand [F] bool.
+            device: Of all tensors.
+
+        Raises:
+            GoalError: A field has a value that cannot be stacked.
+        """
+        self.kinds = list(dict.fromkeys(type(goal) for goal in goals))
+        place = [self.kinds.index(type(goal)) for goal in goals]
+        row = [place[:index].count(kind) for index, kind in enumerate(place)]
+        self._kind = torch.tensor(place, device=device)  # [I] place in `kinds`
+        self._row = torch.tensor(row, device=device)  # [I] row among its kind
+        self._columns: list[dict[str, Deal]] = [
+            {
+                field.name: _column(
+                    field.name, [getattr(goal, field.name) for goal in alike], hands
+                )
+                for field in fields(kind)
+            }
+            for kind in self.kinds
+            for alike in [[goal for goal in goals if type(goal) is kind]]
+        ]
+
+    def deal(
+        self, index: Tensor, scene: Snapshot, counts: Tensor | None = None
+    ) -> GoalBatch:
+        """Give each scene the goal of an index, its references resolved there.
+
+        Args:
+            index: Which goal [N] int64.
+            scene: The scenes.
+            counts: Which rows are asked at all [N] bool; None: all.
+
+        Raises:
+            GoalError: A reference does not fit exactly one object.
+        """
+        kind, row = self._kind[index], self._row[index]  # [N]
+        parts = []
+        for place in kind.unique().tolist():
+            chosen = kind == place  # [N]
+            counted = chosen if counts is None else chosen & counts
+            rows = row.where(chosen, 0)
+            asked = {
+                name: deal(rows, counted, scene)
+                for name, deal in self._columns[place].items()
+            }
+            parts.append((chosen, self.kinds[place], SimpleNamespace(**asked)))
+        return GoalBatch(tuple(parts))
+
+
+def _column(name: str, values: list[Any], hands: Mapping[str, Tensor]) -> Deal:
+    """Return how the values of one field are dealt; see `goals` for the rules."""
+    device = next(iter(hands.values())).device
+    if all(isinstance(value, Ref) for value in values):
+        return _refs(values, device)
+    if all(isinstance(value, Goal) for value in values):
+        table = GoalTable(values, hands, device)
+        return lambda rows, counts, scene: table.deal(rows, scene, counts)
+    if name == "hand":
+        return _indexed(torch.stack([_fingers(value, hands) for value in values]))
+    if name == "direction":
+        return _indexed(torch.tensor([DIRECTIONS[v] for v in values], device=device))
+    if all(isinstance(value, Real) for value in values):
+        return _indexed(torch.tensor(values, dtype=torch.float32, device=device))
+    raise GoalError(
+        f"field {name!r} of a goal: got {values[0]!r}, expected a Ref, a Goal, a "
+        "number, or a field named `hand` or `direction`"
+    )
+
+
+def _indexed(column: Tensor) -> Deal:
+    return lambda rows, counts, scene: column[rows]
+
+
+def _fingers(hand: str | None, hands: Mapping[str, Tensor]) -> Tensor:
+    if hand is None:
+        return torch.stack(list(hands.values())).any(dim=0)
+    if hand not in hands:
+        raise GoalError(
+            f"hand of a goal: got {hand!r}, available on this robot: {', '.join(hands)}"
+        )
+    return hands[hand]
+
+
+def _refs(refs: list[Ref], device: torch.device) -> Deal:
+    """Return how references become masks [N, C]; each is looked up once."""
+    distinct = list(dict.fromkeys(refs))
+    which = torch.tensor([distinct.index(ref) for ref in refs], device=device)
+
+    def deal(rows: Tensor, counts: Tensor, scene: Snapshot) -> Tensor:
+        used = which[rows]  # [N]
+        masks = torch.zeros_like(scene.color, dtype=torch.bool)
+        for place in used.unique().tolist():
+            fits = distinct[place].resolve(scene)
+            masks = torch.where((used == place)[:, None], fits, masks)
+        wrong = counts & (masks.sum(dim=1) != 1)
+        if wrong.any():
+            env = int(wrong.nonzero()[0])
+            raise GoalError(
+                f"{distinct[int(used[env])]}: got {int(masks[env].sum())} objects that "
+                f"fit in env {env}, expected exactly one"
+            )
+        return masks
+
+    return deal

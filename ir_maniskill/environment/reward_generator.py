@@ -1,159 +1,150 @@
-"""Reward Generator: pure tensor functions from contacts to reward (Sec. III-A, IV).
+"""Reward Generator: from measured goals to reward, pure tensor functions (Sec. IV).
 
-Nothing here knows the simulator. Legend: N envs, F fingers, C objects.
+Nothing here knows the simulator, or any kind of goal.
+Legend: N envs, F fingers, C objects, K reward terms.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from ir_maniskill.experiment import Experiment
+from ir_maniskill.goals import MOVED, Measure
+from ir_maniskill.snapshot import Snapshot
+
+TERMS = (
+    "hold",
+    "hold_after_foul",
+    "approach",
+    "gather",
+    "gather_after_foul",
+    "foul",
+    "speed",
+)
+"""Names of the K terms of the dense reward, as measured: all but `hold` at least 0."""
+
+NEAR = 0.1
+"""Distance at which nearness has fallen to a quarter, about [m]."""
+
+TOP_SPEED = 0.3
+"""Speed from which on a moving object is penalized no more [m/s]."""
 
 
 @dataclass(frozen=True)
-class FingerCount:
-    """How many fingers touch what."""
+class Verdict:
+    """What the contacts and motions mean for the goal of each scene."""
 
     right: Tensor
-    """Fingers on the named object [N] int64."""
+    """Which fingers touch as the goal asks [N, F] bool."""
     wrong: Tensor
-    """Fingers on any other object [N] int64."""
+    """Which fingers touch as it does not allow [N, F] bool."""
+    disturbed: Tensor
+    """Whether an object was moved that may not be [N] bool."""
+
+    @property
+    def foul(self) -> Tensor:
+        """Whether anything is touched or moved that the goal does not allow [N]."""
+        return self.wrong.any(dim=1) | self.disturbed
 
 
-def split_fingers(contact: Tensor, named: Tensor) -> tuple[Tensor, Tensor]:
-    """Return which fingers are on the named object, and which on others [N, F] bool.
-
-    A finger that touches both is in both.
-
-    Args:
-        contact: Whether finger f touches object c [N, F, C] bool.
-        named: Which object is named, one-hot [N, C] bool.
-    """
-    named = named[:, None]  # [N, 1, C]
-    return (contact & named).any(2), (contact > named).any(2)
-
-
-def count_fingers(contact: Tensor, named: Tensor) -> FingerCount:
-    """Count the fingers on the named object and on the others, as `split_fingers`."""
-    right, wrong = split_fingers(contact, named)
-    return FingerCount(right.sum(1), wrong.sum(1))
+def judge(scene: Snapshot, measure: Measure) -> Verdict:
+    """Tell right from wrong contacts, and whether something was disturbed."""
+    serves = measure.serves & ~measure.bars  # [N, F, C]
+    asks = measure.serves.flatten(1).any(dim=1)[:, None, None]
+    fouls = measure.bars | (asks & ~measure.serves)
+    moved = scene.moved.norm(dim=2) > MOVED  # [N, C]
+    return Verdict(
+        right=(scene.contact & serves).any(dim=2),
+        wrong=(scene.contact & fouls).any(dim=2),
+        disturbed=(moved & ~measure.may_move).any(dim=1),
+    )
 
 
-def sparse_reward(experiment: Experiment, count: FingerCount) -> Tensor:
+def sparse_reward(
+    experiment: Experiment, holds: Tensor, level: Tensor, wrong_fingers: Tensor
+) -> Tensor:
     """Return the paper's reward of the experiment [N] float32.
 
-    "binary" (experiments I, II): 1 while any finger is on the named object.
-    "per_finger" (experiment III): 1 for each such finger. Both take
-    `wrong_penalty` for each finger on another object (0.1 in experiment III).
+    "binary" (experiments I, II): 1 while the goal holds. "per_finger" (experiment III):
+    its level, which for a touch is the number of fingers. Both take `wrong_penalty` for
+    each wrong finger (0.1 in experiment III).
     """
-    return _touch_reward(experiment, count, experiment.reward == "per_finger")
+    gain = holds.float() if experiment.reward == "binary" else level
+    return gain - experiment.wrong_penalty * wrong_fingers
 
 
-def _touch_reward(
-    experiment: Experiment, count: FingerCount, each_finger: bool
+def reward_terms(
+    scene: Snapshot, measure: Measure, verdict: Verdict, fouled: Tensor
 ) -> Tensor:
-    right = count.right if each_finger else count.right.clamp(max=1)
-    return right.float() - experiment.wrong_penalty * count.wrong
+    """Return the terms of the dense reward, which is ours [N, K], as in `TERMS`.
 
-
-PUSH_LIMIT = 0.3
-"""Speed from which on a moving object costs no more [m/s]."""
+    Args:
+        scene: The scenes.
+        measure: Their goals.
+        verdict: What their contacts mean.
+        fouled: Whether there has been a foul in the episode, this step's too [N] bool.
+    """
+    clean, fouled = (~fouled).float(), fouled.float()
+    each = scene.distance.where(measure.serves, torch.inf).amin(dim=2)  # [N, F]
+    gather = (1 - torch.tanh(each / NEAR)).sum(dim=1)  # fingers that may not: 0
+    gather = gather / measure.serves.any(dim=2).sum(dim=1).clamp(min=1)
+    speed = scene.velocity.norm(dim=2) * measure.still  # [N, C]
+    terms = (
+        measure.level * clean,
+        measure.level * fouled,
+        1 - torch.tanh(measure.gap / NEAR),
+        gather * clean,
+        gather * fouled,
+        verdict.foul.float(),
+        speed.amax(dim=1).clamp(max=TOP_SPEED),
+    )
+    return torch.stack(terms, dim=1)
 
 
 @dataclass(frozen=True)
-class DenseWeights:
-    """Weights of the dense reward, which is ours and not the paper's."""
+class RewardWeights:
+    """Weights of the dense reward's terms."""
 
-    reach: float = 0.5
-    """Reward of bringing a hand to the named object, at most."""
-    reach_scale: float = 0.1
-    """Distance at which `reach` has fallen to a quarter, about [m]."""
-    each_finger: bool = False
-    """Whether each finger on the named object counts in all experiments, also where
-    the paper's reward is for touching it at all (I, II)."""
+    hold: float = 1.0
+    """Of the goal's level: for a touch, of each finger."""
+    approach: float = 0.5
+    """Of bringing the gap to 0, at most."""
     gather: float = 4.0
-    """Reward of bringing all fingers to the named object, at most; only where each
-    finger counts."""
-    gather_scale: float = 0.1
-    """Distance at which a finger's part of `gather` has fallen to a quarter [m]."""
-    wrong: float = 0.5
-    """Taken while another object is touched by any finger."""
-    push: float = 0.0
-    """Taken for each m/s at which the named object moves, counted up to `PUSH_LIMIT`:
-    what makes holding it better than sweeping it along."""
-    spoiled: float = 0.25
-    """Share of touch and `gather` that is left once another object has been touched
-    in the episode: what makes touching only the named object worth learning."""
-
-    def counts_each_finger(self, experiment: Experiment) -> bool:
-        """Whether each finger on the named object adds to the reward."""
-        return self.each_finger or experiment.reward == "per_finger"
-
-    def at_price(self, share: float) -> DenseWeights:
-        """Return the weights with a share, 0 to 1, of `wrong`, `push` and `spoiled`."""
-        spoiled = self.spoiled + (1 - share) * (1 - self.spoiled)
-        wrong, push = share * self.wrong, share * self.push
-        return replace(self, wrong=wrong, push=push, spoiled=spoiled)
+    """Of bringing all fingers that may touch to what they may touch, at most."""
+    foul: float = 0.5
+    """Penalty while something is touched or moved that the goal does not allow."""
+    speed: float = 6.0
+    """Penalty for each m/s at which a touched object moves, up to `TOP_SPEED`: what
+    makes holding it better than sweeping it along."""
+    after_foul: float = 0.25
+    """Share of `hold` and `gather` that is left after a foul in the episode: what makes
+    a goal worth reaching without one."""
 
     def __post_init__(self) -> None:
         """Check the fields.
 
         Raises:
-            ValueError: A weight is negative or not finite, a scale is 0, or the share
-                `spoiled` is more than 1.
+            ValueError: A weight is negative or not finite, or a share is more than 1.
         """
         for name, value in vars(self).items():
-            scale, share = name.endswith("_scale"), name == "spoiled"
-            fits = 0 <= value < math.inf and (value > 0 or not scale)
-            if not fits or (share and value > 1):
+            high = 1 if name == "after_foul" else math.inf
+            if not (0 <= value <= high and math.isfinite(value)):
                 raise ValueError(
-                    f"dense_weights: got {name}={value!r}, expected a finite number of "
-                    "at least 0 (scales: more than 0; spoiled: at most 1)"
+                    f"reward_weights: got {name}={value!r}, expected a finite number "
+                    "of at least 0 (after_foul: at most 1)"
                 )
 
+    def vector(self) -> Tensor:
+        """Return the weight of each of `TERMS`, penalties with their sign [K]."""
+        kept = self.after_foul
+        hold, gather = self.hold, self.gather
+        terms = (hold, hold * kept, self.approach, gather, gather * kept)
+        return torch.tensor((*terms, -self.foul, -self.speed))
 
-def dense_reward(
-    experiment: Experiment,
-    count: FingerCount,
-    distance: Tensor,
-    speed: Tensor,
-    wrong_once: Tensor,
-    weights: DenseWeights,
-) -> Tensor:
-    """Return the sparse reward shaped toward touching the named object alone [N].
-
-    With `weights.each_finger` it is that of experiment III that is shaped.
-
-    Args:
-        experiment: Whose reward to shape.
-        count: Fingers on the named and on other objects.
-        distance: From each finger to the named object's center [N, F] [m].
-        speed: Of the named object [N] [m/s].
-        wrong_once: Whether another object has been touched so far [N] bool.
-        weights: How much each term counts.
-    """
-    kept = torch.where(wrong_once, weights.spoiled, 1.0)  # [N]
-    each_finger = weights.counts_each_finger(experiment)
-    touch = _touch_reward(experiment, count, each_finger)
-    touch = torch.where(touch > 0, kept * touch, touch)
-    nearest = distance.min(dim=1).values  # [N]
-    reach = weights.reach * (1 - torch.tanh(nearest / weights.reach_scale))
-    if each_finger:
-        near = 1 - torch.tanh(distance / weights.gather_scale)  # [N, F]
-        reach = reach + kept * weights.gather * near.mean(dim=1)
-    price = weights.wrong * count.wrong.clamp(max=1)
-    price = price + weights.push * speed.clamp(max=PUSH_LIMIT)
-    return touch + reach - price
-
-
-def highest_reward(
-    experiment: Experiment, fingers: int, weights: DenseWeights
-) -> float:
-    """Return the largest dense reward that one step can give."""
-    if weights.counts_each_finger(experiment):
-        return fingers + weights.reach + weights.gather
-    return 1.0 + weights.reach
+    def highest(self, fingers: int) -> float:
+        """Return the largest dense reward that one step of a touch can give."""
+        return self.hold * fingers + self.approach + self.gather

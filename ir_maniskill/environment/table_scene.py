@@ -23,7 +23,8 @@ from mani_skill.utils.sapien_utils import look_at
 from mani_skill.utils.structs import Actor
 from torch import Tensor
 
-from ir_maniskill.experiment import COLORS, OBJECT_SIZE, TABLE, TouchObject
+from ir_maniskill.experiment import OBJECT_SIZE, TABLE, TouchObject
+from ir_maniskill.goals import COLORS
 
 TABLE_TOP = 0.03
 """Height of the table top [m]."""

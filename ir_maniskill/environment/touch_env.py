@@ -13,7 +13,7 @@ import numpy as np
 import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
-from mani_skill.sensors.camera import Camera, CameraConfig
+from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import common
 from mani_skill.utils.structs import Pose
 from mani_skill.utils.structs.types import SceneConfig, SimConfig
@@ -22,33 +22,30 @@ from torch import Tensor
 from ir_maniskill import experiment as catalog
 from ir_maniskill.doctor import require_vulkan
 from ir_maniskill.environment import reward_generator, table_scene
-from ir_maniskill.environment.bodies import positions, speeds
-from ir_maniskill.environment.instructional_set import InstructionalSet
-from ir_maniskill.environment.reward_generator import DenseWeights, FingerCount
+from ir_maniskill.environment.bodies import poses, velocities
+from ir_maniskill.environment.instructional_set import GoalBatch, InstructionalSet
+from ir_maniskill.environment.rendering import RenderedEnv
+from ir_maniskill.environment.reward_generator import RewardWeights
 from ir_maniskill.environment.robots.nao import Nao
 from ir_maniskill.environment.robots.robot import (
     Robot,
     available_robots,
     require_robot,
 )
-from ir_maniskill.experiment import Experiment
-
-TOUCH_FORCE = 0.01
-"""Force from which a contact counts as a touch [N]."""
+from ir_maniskill.experiment import Experiment, ExperimentError
+from ir_maniskill.goals import COLORS, SHAPES
+from ir_maniskill.snapshot import Snapshot
 
 CONTROL_FREQ = 20
 """Steps of an episode in a second [Hz]."""
 
-TASK_STATE = ("instruction_index", "success_once", "wrong_once")
-"""What of the task belongs to the env state, beside bodies and joint targets."""
 
-
-class TouchEnv(BaseEnv):
-    """A robot behind a table is told by a sentence which object to touch.
+class TouchEnv(RenderedEnv):
+    """A robot behind a table is told by a sentence what to do.
 
     **Task Description:**
-    Each episode has one sentence, such as "Touch the blue cube.". The robot is
-    rewarded for fingers on the object that it names (paper, Sec. IV).
+    Each episode has one sentence, such as "Touch the blue cube.", and a goal that it
+    asks for. The robot is rewarded while the goal holds (paper, Sec. IV).
 
     **Randomizations:**
     - the sentence, drawn from the experiment's Instructional Set
@@ -56,8 +53,8 @@ class TouchEnv(BaseEnv):
     - which object lies where, if `Experiment.shuffled`
 
     **Success Conditions:**
-    - a finger touches the named object. This does not end the episode, since holding
-      the touch is what is rewarded; the time limit does.
+    - the goal holds, e.g. a finger touches the named object. This does not end the
+      episode, since holding it is what is rewarded; the time limit does.
     """
 
     metadata: ClassVar = {**BaseEnv.metadata, "render_fps": CONTROL_FREQ}
@@ -71,7 +68,7 @@ class TouchEnv(BaseEnv):
         experiment: str | Experiment,
         robot_uids: str | type[Robot] = Nao.uid,
         render_backend: str | None = "auto",
-        dense_weights: dict[str, Any] | None = None,
+        reward_weights: dict[str, float] | None = None,
         **kwargs: Any,
     ) -> None:
         """Build the env.
@@ -82,28 +79,35 @@ class TouchEnv(BaseEnv):
                 one.
             render_backend: As for `BaseEnv`; "auto" is a CUDA device where there is
                 one and else whatever Vulkan finds, software included.
-            dense_weights: Changes of `DenseWeights`, used by the dense reward modes.
+            reward_weights: Changes of `RewardWeights`, for the dense reward modes.
             *args: As for `BaseEnv`.
             **kwargs: As for `BaseEnv`.
 
         Raises:
             UnknownExperimentError: There is no experiment of that id.
+            ExperimentError: It is no experiment, or its goals don't fit the robot.
             RobotError: The robot cannot be used.
+            ValueError: Several envs are asked for, but physics is on the CPU.
             RuntimeError: No Vulkan device can render here; says what to install.
         """
         if isinstance(experiment, str):
             experiment = catalog.get(experiment)
+        if not isinstance(experiment, Experiment):
+            raise ExperimentError(
+                f"experiment: got {experiment!r}, expected an Experiment or its id, "
+                f"available: {', '.join(catalog.available())}"
+            )
         self.experiment = experiment
+        _require_one_on_cpu(kwargs)
         require_robot(robot_uids)
         # ManiSkill warns of robots that are not in here; ours are not the only ones.
         self.SUPPORTED_ROBOTS = (*available_robots(), robot_uids)
-        self.dense_weights = replace(DenseWeights(), **(dense_weights or {}))
-        self._colors_only = False  # without a renderer no sensors are set up
-        self._drawing = False  # whether pictures of this very state are under way
-        self._fresh = True  # whether some env was reset after the last step
+        self._reward_weights = replace(RewardWeights(), **(reward_weights or {}))
+        self._stepped = False  # whether a step was made that is not judged yet
         if render_backend == "auto":
             render_backend = "gpu" if torch.cuda.is_available() else "cpu"
-        if render_backend not in ("none", None):
+        render_backend = render_backend or "none"
+        if render_backend != "none":
             require_vulkan()
         super().__init__(
             *args, robot_uids=robot_uids, render_backend=render_backend, **kwargs
@@ -140,35 +144,26 @@ class TouchEnv(BaseEnv):
     def _load_lighting(self, options: dict) -> None:
         table_scene.add_lights(self.scene, shadow=self.enable_shadow)
 
-    def _setup_sensors(self, options: dict) -> None:
-        # Picture formats are global: a video camera made earlier leaves floats behind.
-        sapien.render.set_picture_format("Color", "r8g8b8a8unorm")
-        super()._setup_sensors(options)
-        self._sensor_params: dict | None = None
-        wanted = {kind for kind, on in vars(self.obs_mode_struct.visual).items() if on}
-        self._colors_only = wanted == {"rgb"} and not self._sim_device.is_cuda()
-        for name, sensor in self._sensors.items():
-            pack = sensor.config.shader_config
-            drawn = {kind for kinds in pack.texture_names.values() for kind in kinds}
-            if not wanted <= drawn:
-                raise ValueError(
-                    f"obs_mode: got {self.obs_mode!r}, but the shader pack of {name} "
-                    f"draws only {', '.join(sorted(drawn))}; choose another shader_pack"
-                )
-
     def _after_reconfigure(self, options: dict) -> None:
-        self.instructional_set = InstructionalSet(self.experiment, self.device)
-        self._contact_force = self.agent.touch_query(self.objects)
-        things = self.experiment.objects
+        things, count, device = self.experiment.objects, self.num_envs, self.device
+        hands = {
+            name: torch.tensor(fingers, device=device)
+            for name, fingers in _hands(self.agent).items()
+        }
+        self.instructional_set = InstructionalSet(self.experiment, hands, device)
+        self._touch = self.agent.touch_sensor(self.objects)
+        self._weights = self._reward_weights.vector().to(device)
         heights = [table_scene.OBJECT_HEIGHT[thing.shape] for thing in things]
         self._places = np.array([thing.position for thing in things])  # [C, 2] [m]
         self._object_z = table_scene.TABLE_TOP + np.array(heights) / 2  # [C] [m]
-        self.instruction_index = self._zeros(torch.int64)
-        self._success_once = self._zeros(torch.bool)
-        self._wrong_once = self._zeros(torch.bool)
-
-    def _zeros(self, dtype: torch.dtype) -> Tensor:
-        return torch.zeros(self.num_envs, dtype=dtype, device=self.device)
+        kinds = [(list(COLORS).index(o.color), SHAPES.index(o.shape)) for o in things]
+        color_and_shape = torch.tensor(kinds, device=device).T
+        self._color, self._shape = color_and_shape[:, None].repeat(1, count, 1)
+        self.instruction_index = torch.zeros(count, dtype=torch.int64, device=device)
+        self._stage = torch.zeros_like(self.instruction_index)
+        self._success_once = torch.zeros(count, dtype=torch.bool, device=device)
+        self._wrong_once = torch.zeros_like(self._success_once)
+        self._start = torch.zeros(count, len(things), 7, device=device)
 
     # -- Episode ---------------------------------------------------------------------
 
@@ -179,32 +174,53 @@ class TouchEnv(BaseEnv):
             noise, np.cumsum([1, count, 2 * count, count]), axis=1
         )
         self._choose_instruction(env_idx, pick[:, 0], options.get("instruction"))
-        self._place_objects(order, 2 * place - 1, 2 * yaw - 1)
+        self._place_objects(env_idx, order, 2 * place - 1, 2 * yaw - 1)
         jitter = self._tensor(2 * joint - 1) * self.experiment.jitter.joints
         qpos = self.agent.clamp_qpos(self.agent.start_qpos + jitter)
         self.agent.robot.set_qpos(qpos)
         # The last step's info, which others may keep, holds these very tensors.
         self._success_once = self._success_once.index_fill(0, env_idx, False)
         self._wrong_once = self._wrong_once.index_fill(0, env_idx, False)
-        self._drawing = False
+        self._stage = self._stage.index_fill(0, env_idx, 0)
+        self._drawing = self._stepped = False
+        self._touch.clear(env_idx)
+        self._resolve_goals()
 
     def _choose_instruction(
         self, env_idx: Tensor, uniform: np.ndarray, forced: Any
     ) -> None:
         index = self.instructional_set.pick(self._tensor(uniform))
         if forced is not None:
-            index = torch.as_tensor(forced, device=self.device)
-            in_range = (index >= 0) & (index < len(self.instructional_set))
-            if index.shape not in ((), env_idx.shape) or not in_range.all():
-                raise ValueError(
-                    f"reset option 'instruction': got {forced}, expected indices 0 to "
-                    f"{len(self.instructional_set) - 1}, one for all envs or one for "
-                    f"each of {len(env_idx)}: {self.experiment.sentences}"
-                )
+            index = self._index_of(forced, len(env_idx))
         self.instruction_index[env_idx] = index
 
+    def _index_of(self, forced: Any, count: int) -> Tensor:
+        """Return the indices of instructions given by index or by sentence."""
+        sentences = self.experiment.sentences
+        given = [forced] if isinstance(forced, str) else forced
+        if isinstance(given, list | tuple) and set(given) <= set(sentences):
+            given = [sentences.index(sentence) for sentence in given]
+        try:
+            index = torch.as_tensor(given, device=self.device)
+            whole = not (index.is_floating_point() or index.dtype == torch.bool)
+            in_range = whole and bool(((index >= 0) & (index < len(sentences))).all())
+        except (TypeError, ValueError, RuntimeError):
+            in_range = False
+        if not in_range or index.shape not in ((), (1,), (count,)):
+            raise ValueError(
+                f"reset option 'instruction': got {forced!r}, expected sentences or "
+                f"indices 0 to {len(sentences) - 1}, one for all envs or one for each "
+                f"of {count}: {sentences}"
+            )
+        return index
+
+    def _resolve_goals(self) -> None:
+        """Look up what the sentences of all envs refer to, as their episodes began."""
+        table = self.instructional_set.goals
+        self._goals: GoalBatch = table.deal(self.instruction_index, self.snapshot())
+
     def _place_objects(
-        self, order: np.ndarray, place: np.ndarray, yaw: np.ndarray
+        self, env_idx: Tensor, order: np.ndarray, place: np.ndarray, yaw: np.ndarray
     ) -> None:
         """Lay the objects out; all arguments are uniform noise with b rows."""
         batch, count = order.shape
@@ -215,6 +231,8 @@ class TouchEnv(BaseEnv):
         z = np.broadcast_to(self._object_z, (batch, count))
         position = self._tensor(np.concatenate([xy, z[..., None]], axis=-1))
         rotation = self._tensor(table_scene.yaw_quaternion(jitter.yaw * yaw))
+        self._start = self._start.clone()
+        self._start[env_idx] = torch.cat([position, rotation], dim=-1)
         for index, thing in enumerate(self.objects):
             thing.set_pose(Pose.create_from_pq(position[:, index], rotation[:, index]))
 
@@ -234,11 +252,12 @@ class TouchEnv(BaseEnv):
 
         Args:
             seed: Seeds of the envs; None goes on with their random streams.
-            options: ManiSkill's, and "instruction": indices of the sentences to give,
-                an int or [b] int64, instead of drawing them.
+            options: ManiSkill's, and "instruction": the sentences to give instead of
+                drawing them, as text or index, one for all envs or b of them.
 
         Raises:
-            ValueError: An instruction index is out of range, or there are not b.
+            ValueError: There is no such instruction, or there are not b.
+            GoalError: A sentence refers to no object of its scene, or to several.
         """
         options = dict(options or {})
         if isinstance(seed, np.integer):
@@ -246,34 +265,58 @@ class TouchEnv(BaseEnv):
         if seed is not None and not self._sim_device.is_cuda():
             options.setdefault("reconfigure", True)
         gym.Env.reset(self, seed=seed if isinstance(seed, int) else None)
-        self._fresh = True
         return super().reset(seed, options)
 
     def step(self, action: Any) -> tuple[Any, Tensor, Tensor, Tensor, dict]:
-        """Step as ManiSkill does, except that success does not end the episode."""
-        if isinstance(action, np.ndarray) and action.flags.writeable:
-            action = torch.from_numpy(action)  # ManiSkill's way takes much longer
+        """Step as ManiSkill does, except that success does not end the episode.
+
+        Raises:
+            ValueError: The action is not finite (checked on the CPU only).
+        """
+        if isinstance(action, np.ndarray):  # ManiSkill's way takes much longer
+            action = torch.from_numpy(np.array(action))
+        if isinstance(action, Tensor):
+            action = action.detach().float()
+            if not self._sim_device.is_cuda() and not action.isfinite().all():
+                raise ValueError(
+                    f"action: got {action.tolist()}, expected finite numbers"
+                )
         obs, reward, terminated, truncated, info = super().step(action)
         return obs, reward, terminated.zero_(), truncated, info
 
-    # -- What the sentence asks ------------------------------------------------------
+    def _before_control_step(self) -> None:
+        self._touch.clear()
 
-    @property
-    def target_index(self) -> Tensor:
-        """Index in `objects` of the one that the active sentence names [N] int64."""
-        return self.instructional_set.targets.index_select(0, self.instruction_index)
+    def _after_simulation_step(self) -> None:
+        self._touch.update()
 
-    @property
-    def named(self) -> Tensor:
-        """Which object the active sentence names, one-hot [N, C] bool."""
-        return self.instructional_set.named.index_select(0, self.instruction_index)
+    def _after_control_step(self) -> None:
+        self._stepped = True
+        super()._after_control_step()
+
+    # -- Measures --------------------------------------------------------------------
 
     def get_language_instruction(self) -> list[str]:
         """Return the active sentence i_t of each env (N strings)."""
         sentences = self.experiment.sentences
         return [sentences[index] for index in self.instruction_index.tolist()]
 
-    # -- Measures --------------------------------------------------------------------
+    def snapshot(self) -> Snapshot:
+        """Return what goals are measured on, as of now.
+
+        Contacts are those of the last step; after a reset or a change of the state
+        there are none until the next step.
+        """
+        return Snapshot(
+            contact=self._touch.read(),
+            fingertip=self.agent.finger_position(),
+            pose=poses(self.objects),
+            start=self._start,
+            velocity=velocities(self.objects),
+            color=self._color,
+            shape=self._shape,
+            stage=self._stage,
+        )
 
     def get_info(self) -> dict[str, Tensor]:
         """Return what `evaluate` measures, and `elapsed_steps` since the reset [N]."""
@@ -283,30 +326,37 @@ class TouchEnv(BaseEnv):
         return info
 
     def evaluate(self) -> dict[str, Tensor]:
-        """Measure contacts and what they mean for the active sentence.
+        """Measure the goals; what a step brought is added to the episode once.
 
         Returns:
-            Per env [N]: `right_fingers` and `wrong_fingers` (int64), `success` (the
-            named object is touched now), `success_once` and `wrong_once` (so far in
-            this episode), `exclusive_success` (the named object has been touched and
-            no other) as bool; and `contact` [N, F, C] bool.
+            Per env [N]: `right_fingers` and `wrong_fingers` (int64): fingers that touch
+            as the goal asks, and as it does not allow; `success` (the goal holds),
+            `success_once` and `wrong_once` (so far in this episode; wrong is a foul),
+            `exclusive_success` (it has held, without any foul) as bool; `contact`
+            [N, F, C] bool; and in the dense reward modes `reward_terms` [N, K].
         """
-        contact = self._contact_force() > TOUCH_FORCE
-        if self._fresh:  # PhysX still holds the contacts of the last episode
-            contact &= (self._elapsed_steps > 0)[:, None, None]
-        count = reward_generator.count_fingers(contact, self.named)
-        success = count.right > 0
-        self._success_once = self._success_once | success
-        self._wrong_once = self._wrong_once | (count.wrong > 0)
-        return {
-            "contact": contact,
-            "right_fingers": count.right,
-            "wrong_fingers": count.wrong,
-            "success": success,
+        scene = self.snapshot()
+        self.measure = self._goals.measure(scene)
+        self.verdict = reward_generator.judge(scene, self.measure)
+        if self._stepped:
+            self._stepped = False
+            self._stage = self.measure.stage
+            self._success_once = self._success_once | self.measure.holds
+            self._wrong_once = self._wrong_once | self.verdict.foul
+        info = {
+            "contact": scene.contact,
+            "right_fingers": self.verdict.right.sum(dim=1),
+            "wrong_fingers": self.verdict.wrong.sum(dim=1),
+            "success": self.measure.holds,
             "success_once": self._success_once,
             "wrong_once": self._wrong_once,
             "exclusive_success": self._success_once > self._wrong_once,
         }
+        if self._reward_mode in ("dense", "normalized_dense"):
+            info["reward_terms"] = reward_generator.reward_terms(
+                scene, self.measure, self.verdict, self._wrong_once
+            )
+        return info
 
     # -- Observation o_t -------------------------------------------------------------
 
@@ -323,78 +373,16 @@ class TouchEnv(BaseEnv):
             "instruction": self.instructional_set.tokens.index_select(0, index),
         }
         if self.obs_mode_struct.use_state:
-            obs |= self._positions()
-            obs["target_object"] = self.named.float()  # [N, C]
-            obs["wrong_once"] = info["wrong_once"].float()[:, None]  # [N, 1]
+            serves = self.measure.serves  # [N, F, C]
+            obs |= {
+                "object_position": poses(self.objects)[..., :3],  # [N, C, 3]
+                "finger_position": self.agent.finger_position(),  # [N, F, 3]
+                "target_object": serves.any(dim=1).float(),  # [N, C]
+                "target_finger": serves.any(dim=2).float(),  # [N, F]
+                "gap": self.measure.gap[:, None],  # [N, 1]
+                "wrong_once": info["wrong_once"].float()[:, None],  # [N, 1]
+            }
         return obs
-
-    def _flatten_raw_obs(self, obs: Any) -> Any:
-        """Fetch pictures under way; flatten as ManiSkill does, but all at once."""
-        if self._drawing:
-            obs["sensor_data"] = self._get_obs_sensor_data()
-        if not self.obs_mode_struct.state:
-            return obs
-        leaves = [*obs.pop("agent").values(), *obs.pop("extra").values()]
-        flat = torch.cat([leaf.flatten(1) for leaf in leaves], dim=1)
-        return flat if self.obs_mode == "state" else obs | {"state": flat}
-
-    def _positions(self) -> dict[str, Tensor]:
-        return {
-            "object_position": positions(self.objects),  # [N, C, 3]
-            "finger_position": self.agent.finger_position(),  # [N, F, 3]
-        }
-
-    def _get_obs_with_sensor_data(
-        self, info: dict[str, Tensor], apply_texture_transforms: bool = True
-    ) -> dict:
-        """Observe; within a step pictures come last, in `_flatten_raw_obs`."""
-        if not self._drawing:
-            return super()._get_obs_with_sensor_data(info, apply_texture_transforms)
-        return {
-            "agent": self._get_obs_agent(),
-            "extra": self._get_obs_extra(info),
-            "sensor_param": self.get_sensor_params(),
-            "sensor_data": {},
-        }
-
-    def _get_obs_sensor_data(self, apply_texture_transforms: bool = True) -> dict:
-        drawing, self._drawing = self._drawing, False
-        if not (self._colors_only and apply_texture_transforms):
-            return super()._get_obs_sensor_data(apply_texture_transforms)
-        if not drawing:
-            self._draw_pictures()
-        sensors = self.scene.sensors.items()
-        return {name: self._fetch_color(sensor) for name, sensor in sensors}
-
-    def _after_control_step(self) -> None:
-        self._fresh = False
-        # Software renderers draw on other cores while contacts are judged here.
-        if self._colors_only:
-            self._draw_pictures()
-            self._drawing = True
-
-    def _draw_pictures(self) -> None:
-        """Have the renderer begin with what all sensors see, and do not wait."""
-        self.scene.update_render(update_sensors=True, update_human_render_cameras=False)
-        self.capture_sensor_data()
-
-    def _fetch_color(self, sensor: Camera) -> dict[str, Tensor]:
-        """Return the picture that `sensor` drew, as its `get_obs` but not copied.
-
-        Torch copies even small pictures on all cores, which wait for each other.
-        """
-        (camera,) = sensor.camera._render_cameras
-        color = camera.get_picture("Color")[None]  # [1, H, W, 4]
-        if color.dtype == np.uint8:  # NumPy cuts alpha off in less time than torch
-            return {"rgb": torch.from_numpy(color[..., :3])}
-        transform = sensor.config.shader_config.texture_transforms["Color"]
-        return transform(torch.from_numpy(color))
-
-    def get_sensor_params(self) -> dict:
-        """Return the cameras' matrices, computed once: no camera ever moves."""
-        if self._sensor_params is None:
-            self._sensor_params = super().get_sensor_params()
-        return self._sensor_params
 
     # -- Reward r_t ------------------------------------------------------------------
 
@@ -402,45 +390,38 @@ class TouchEnv(BaseEnv):
         self, obs: Any, action: Tensor, info: dict[str, Tensor]
     ) -> Tensor:
         """Return the paper's reward of this experiment [N]."""
-        return reward_generator.sparse_reward(self.experiment, _count(info))
+        return reward_generator.sparse_reward(
+            self.experiment, info["success"], self.measure.level, info["wrong_fingers"]
+        )
 
     def compute_dense_reward(
         self, obs: Any, action: Tensor, info: dict[str, Tensor]
     ) -> Tensor:
-        """Return the paper's reward with our shaping toward the named object [N]."""
-        at = obs["extra"] if self.obs_mode_struct.use_state else self._positions()
-        rows = torch.arange(self.num_envs, device=self.device)
-        goal = at["object_position"][rows, self.target_index]  # [N, 3]
-        distance = (at["finger_position"] - goal[:, None]).norm(dim=-1)
-        return reward_generator.dense_reward(
-            self.experiment,
-            _count(info),
-            distance,
-            speeds(self.objects)[rows, self.target_index],
-            info["wrong_once"],
-            self.dense_weights,
-        )
+        """Return the sum of our weighted terms that lead to the goal [N]."""
+        return info["reward_terms"] @ self._weights
 
     def compute_normalized_dense_reward(
         self, obs: Any, action: Tensor, info: dict[str, Tensor]
     ) -> Tensor:
-        """Return the dense reward divided by the most that a step can give [N]."""
-        highest = reward_generator.highest_reward(
-            self.experiment, len(self.agent.fingers), self.dense_weights
-        )
+        """Return the dense reward divided by the most that a touch can give [N]."""
+        highest = self._reward_weights.highest(len(self.agent.fingers))
         return self.compute_dense_reward(obs, action, info) / highest
 
     # -- State -----------------------------------------------------------------------
 
+    def _task_state(self) -> dict[str, Tensor]:
+        """Return what of the task is state beside bodies and joint targets [N, ...]."""
+        return {
+            "instruction_index": self.instruction_index.float()[:, None],
+            "stage": self._stage.float()[:, None],
+            "success_once": self._success_once.float()[:, None],
+            "wrong_once": self._wrong_once.float()[:, None],
+            "start": self._start.flatten(1).clone(),
+        }
+
     def get_state_dict(self) -> dict:
         """Return bodies, joint targets and the task's own state."""
-        state = super().get_state_dict()
-        task = (self.instruction_index, self._success_once, self._wrong_once)
-        state["task"] = {
-            name: value.float()[:, None]
-            for name, value in zip(TASK_STATE, task, strict=True)
-        }
-        return state
+        return super().get_state_dict() | {"task": self._task_state()}
 
     def set_state_dict(self, state: dict, env_idx: Tensor | None = None) -> None:
         """Restore what `get_state_dict` returned, for all envs or for `env_idx`.
@@ -454,27 +435,49 @@ class TouchEnv(BaseEnv):
             target = self.agent.controller.target.clone()
             target[rows] = state["controller"]["target_qpos"].to(target)
             self.agent.controller.set_state({"target_qpos": target})
+        self._touch.clear(env_idx)
+        self._stepped = False
         if "task" in state:
-            task = {name: state["task"][name][..., 0] for name in TASK_STATE}
-            self.instruction_index[rows] = task["instruction_index"].long()
-            self._success_once = self._success_once.clone()
-            self._wrong_once = self._wrong_once.clone()
-            self._success_once[rows] = task["success_once"].bool()
-            self._wrong_once[rows] = task["wrong_once"].bool()
+            self._set_task_state(state["task"], rows)
+
+    def _set_task_state(self, given: dict[str, Tensor], rows: slice | Tensor) -> None:
+        task = self._task_state()
+        for name, value in given.items():
+            task[name][rows] = value.to(task[name])
+        self.instruction_index = task["instruction_index"][:, 0].long()
+        self._stage = task["stage"][:, 0].long()
+        self._success_once = task["success_once"][:, 0].bool()
+        self._wrong_once = task["wrong_once"][:, 0].bool()
+        self._start = task["start"].view_as(self._start)
+        self._resolve_goals()
 
     def set_state(self, state: Tensor, env_idx: Tensor | None = None) -> None:
         """Restore what `get_state` returned: the same, as one flat row per env."""
         state = common.to_tensor(state, device=self.device)
-        tail = len(self.agent.start_qpos) + len(TASK_STATE)
-        super().set_state(state[:, :-tail], env_idx)
-        target, task = state[:, -tail:].split(
-            [tail - len(TASK_STATE), len(TASK_STATE)], 1
-        )
-        columns = dict(zip(TASK_STATE, task.split(1, dim=1), strict=True))
+        widths = {name: leaf.shape[1] for name, leaf in self._task_state().items()}
+        tail = [len(self.agent.start_qpos), *widths.values()]
+        super().set_state(state[:, : -sum(tail)], env_idx)
+        target, *task = state[:, -sum(tail) :].split(tail, dim=1)
+        leaves = dict(zip(widths, task, strict=True))
         self.set_state_dict(
-            {"controller": {"target_qpos": target}, "task": columns}, env_idx
+            {"controller": {"target_qpos": target}, "task": leaves}, env_idx
         )
 
 
-def _count(info: dict[str, Tensor]) -> FingerCount:
-    return FingerCount(info["right_fingers"], info["wrong_fingers"])
+def _hands(robot: Robot) -> dict[str, list[bool]]:
+    """Return which fingers belong to each hand, [F] each."""
+    return {
+        hand: [finger in fingers for finger in robot.fingers]
+        for hand, fingers in robot.hands.items()
+    }
+
+
+def _require_one_on_cpu(kwargs: dict[str, Any]) -> None:
+    """Raise if several envs are asked for where physics can only be on the CPU."""
+    count, backend = kwargs.get("num_envs", 1), str(kwargs.get("sim_backend", "auto"))
+    on_cpu = not torch.cuda.is_available() or "cpu" in backend
+    if count > 1 and on_cpu:
+        raise ValueError(
+            f"num_envs: got {count}, expected 1 with physics on the CPU; "
+            "`ir_maniskill.make_vec(id, num_envs)` runs several in worker processes"
+        )

@@ -22,7 +22,6 @@ import torch
 from mani_skill.utils.sapien_utils import look_at
 from PIL import Image, ImageDraw, ImageFont
 
-from ir_maniskill.environment.reward_generator import split_fingers
 from ir_maniskill.environment.state import CAMERAS, StateStack
 from ir_maniskill.environment.touch_env import CONTROL_FREQ
 from ir_maniskill.evaluation.evaluate import Policy, choose_instructions, one_thread
@@ -182,10 +181,10 @@ def _play(
         if step < total:
             with one_thread():
                 action = policy(state)
-            obs, reward, _, _, info = env.step(action)
+            obs, reward, *_ = env.step(action)
             state, score = stack.push(obs), score + float(reward)
-            split = split_fingers(info["contact"], base.named)
-            right, wrong = (fingers[0].tolist() for fingers in split)
+            verdict = base.verdict
+            right, wrong = verdict.right[0].tolist(), verdict.wrong[0].tolist()
             history += ((any(right), any(wrong)),)
 
 

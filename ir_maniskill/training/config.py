@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeVar
 
 from ir_maniskill.agent.config import AgentConfig
 from ir_maniskill.checks import ConfigError, require, require_choice
-from ir_maniskill.environment.reward_generator import DenseWeights
+from ir_maniskill.environment.reward_generator import RewardWeights
 
 ControlMode = Literal["pd_joint_target_delta_pos", "pd_joint_pos"]
 RewardMode = Literal["dense", "normalized_dense", "sparse"]
@@ -108,7 +108,7 @@ class TrainConfig:
     reward_mode: RewardMode = "dense"
     """Reward to learn from: "sparse" is the paper's, "dense" is shaped toward touching
     the named object alone, "normalized_dense" is that over the most it can give."""
-    dense_weights: DenseWeights = field(default_factory=DenseWeights)
+    reward_weights: RewardWeights = field(default_factory=RewardWeights)
     """What counts how much in the dense reward."""
     lenient_steps: int = 0
     """Steps over which the prices of touching other objects (`dense_weights.wrong` and
@@ -206,7 +206,7 @@ class TrainConfig:
         }
         if training:
             kwargs["reward_mode"] = self.reward_mode
-            kwargs["dense_weights"] = dataclasses.asdict(self.dense_weights)
+            kwargs["reward_weights"] = dataclasses.asdict(self.reward_weights)
         return kwargs
 
 
@@ -215,7 +215,6 @@ CONFIGS: dict[str, TrainConfig] = {
     "posture": TrainConfig(
         total_steps=250_000,
         eval_episodes=90,
-        dense_weights=DenseWeights(each_finger=True, push=6.0),
         lenient_steps=80_000,
         agent=AgentConfig(posture_gain=1.0, std=1.0),
         ppo=PPOConfig(gamma=0.9),
@@ -259,7 +258,6 @@ CONFIGS: dict[str, TrainConfig] = {
 
 LATER: dict[str, dict[str, object]] = {
     "AgentConfig": {"posture_gain": 0.0, "posture_gain_final": None},
-    "DenseWeights": {"each_finger": False, "push": 0.0},
     "TrainConfig": {
         "lenient_steps": 0,
         "render_backend": "auto",

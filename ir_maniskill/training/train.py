@@ -255,9 +255,6 @@ class Trainer:
         report = self._report(self.agent, self.config.eval_episodes)
         figures = _figures(report)
         held = figures["eval/touching"]
-        weights = self.config.dense_weights
-        if weights.counts_each_finger(self.envs.experiment):
-            held = figures["eval/right_fingers"] / self.state["touch"].shape[2]
         score = figures["eval/worst"] + figures["eval/exclusive"] + held
         if score > self.best_score:
             self.best_score = score
@@ -406,10 +403,7 @@ class Trainer:
 
     def _set_price(self) -> None:
         """Let the price of touching other objects grow with the steps made."""
-        if self.config.lenient_steps:
-            share = min(self.steps / self.config.lenient_steps, 1.0)
-            weights = self.config.dense_weights.at_price(share)
-            self.envs.set_attr("dense_weights", weights)
+        pass
 
     def _due(self, interval: int) -> bool:
         """Whether a multiple of the interval was passed by the last update."""

@@ -36,6 +36,7 @@ JOINTS = tuple(side + joint for side in "LR" for joint in ARM_JOINTS + FINGER_JO
 
 FINGERS = ("LFinger1", "LFinger2", "LThumb", "RFinger1", "RFinger2", "RThumb")
 """The six fingers in the order of the tactile bits."""
+HANDS = {"left": FINGERS[:3], "right": FINGERS[3:]}
 
 # -- Actuation -----------------------------------------------------------------------
 
@@ -91,6 +92,7 @@ class Nao(Robot):
     urdf_path = OUR_URDF
     joints = JOINTS
     fingers = FINGERS
+    hands = HANDS
     postures = POSTURES
 
     def drive(self, joint: str) -> JointGroup:

@@ -26,8 +26,8 @@ from mani_skill.agents.registration import REGISTERED_AGENTS
 from mani_skill.utils.structs import Actor, Link
 from torch import Tensor
 
+from ir_maniskill.environment import contacts
 from ir_maniskill.environment.bodies import positions
-from ir_maniskill.environment.contacts import ContactQuery, contact_query
 
 
 class RobotError(ValueError):
@@ -288,13 +288,15 @@ class Robot(BaseAgent, ABC):
             "target": self._normalize(self.controller.target),
         }
 
-    def touch_query(self, objects: Sequence[Actor]) -> ContactQuery:
-        """Return a query for the force of each finger on each object [N, F, C] [N].
+    def touch_sensor(
+        self, objects: Sequence[Actor]
+    ) -> contacts.CpuTouchSensor | contacts.GpuTouchSensor:
+        """Return a sensor of which finger touches which object [N, F, C].
 
         Args:
             objects: What the fingers may touch; anything else is not felt.
         """
-        return contact_query(self.scene, self.finger_links, objects)
+        return contacts.touch_sensor(self.scene, self.finger_links, objects)
 
     def joint_velocity(self) -> Tensor:
         """Return joint velocities in the action's order [N, J] [rad/s]."""

@@ -1,0 +1,413 @@
+"""Goals: what a sentence asks for, as data that can be measured (Sec. III-A).
+
+A goal is a frozen dataclass. Its fields say what is asked, e.g.
+`Touch(Ref("blue", "cube"), hand="left")`, and its method `measure` says how far that is
+reached in N scenes at once. A verb of your own is one more such class:
+`examples/new_verb.py` has one.
+
+`measure` gets many goals of its kind stacked, as tensors under the fields' names:
+
+| field | tensor |
+| --- | --- |
+| a `Ref` | mask over the objects [N, C] bool, exactly one |
+| a number | [N] float32 |
+| `hand`, a name or None | mask over the fingers [N, F] bool |
+| `direction`, a key of `DIRECTIONS` | unit vector [N, 3] |
+| a `Goal` | its `measure(scene)` |
+
+Legend: N scenes, F fingers, C objects. Lengths are at NAO's scale [m].
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from numbers import Real
+from types import SimpleNamespace
+
+import torch
+from torch import Tensor
+
+from ir_maniskill.snapshot import Snapshot
+
+COLORS: dict[str, tuple[float, float, float]] = {
+    "blue": (0.05, 0.16, 0.85),
+    "red": (0.85, 0.06, 0.05),
+    "green": (0.04, 0.60, 0.12),
+    "yellow": (0.95, 0.75, 0.05),
+    "purple": (0.50, 0.10, 0.65),
+    "orange": (0.95, 0.40, 0.03),
+}
+"""Linear RGB of every color an object may have."""
+
+SHAPES = ("cube", "button")
+"""A cube is a free 4 cm body, a button is fixed to the table."""
+
+DIRECTIONS = {
+    "left": (0.0, 1.0, 0.0),
+    "right": (0.0, -1.0, 0.0),
+    "away": (1.0, 0.0, 0.0),
+}
+"""Where something may be pushed to, as seen by the robot."""
+
+EXTREMES = {
+    "leftmost": (1, 1.0),
+    "rightmost": (1, -1.0),
+    "nearest": (0, -1.0),
+    "farthest": (0, 1.0),
+}
+"""Relations that one of several objects fits: axis and sign of what is largest."""
+
+RELATIONS = ("left_of", "right_of", "other_than")
+"""Relations to another object."""
+
+MOVED = 0.02
+"""From which distance on an object counts as moved [m]."""
+
+
+class GoalError(ValueError):
+    """A goal or reference is malformed, or does not fit its scene."""
+
+
+def _require_choice(what: str, got: object, choices: Iterable[str]) -> None:
+    if got not in (available := tuple(choices)):
+        raise GoalError(f"{what}: got {got!r}, available: {', '.join(available)}")
+
+
+# -- References ------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Relation:
+    """Where an object is, beside another one."""
+
+    kind: str
+    """One of `RELATIONS`."""
+    ref: Ref
+    """The other object."""
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        _require_choice("relation", self.kind, RELATIONS)
+        if not isinstance(self.ref, Ref):
+            raise GoalError(f"{self.kind}: got {self.ref!r}, expected a Ref")
+
+    def fits(self, scene: Snapshot) -> Tensor:
+        """Return which objects are so [N, C] bool."""
+        other = self.ref.resolve(scene)  # [N, C]
+        if self.kind == "other_than":
+            return ~other
+        y = scene.start[..., 1]  # [N, C]
+        at = (y * other).sum(dim=1, keepdim=True)
+        return y > at if self.kind == "left_of" else y < at
+
+
+def left_of(ref: Ref) -> Relation:
+    """Return the relation "left of the ..."."""
+    return Relation("left_of", ref)
+
+
+def right_of(ref: Ref) -> Relation:
+    """Return the relation "right of the ..."."""
+    return Relation("right_of", ref)
+
+
+def other_than(ref: Ref) -> Relation:
+    """Return the relation "the one that is not the ..."."""
+    return Relation("other_than", ref)
+
+
+@dataclass(frozen=True)
+class Ref:
+    """Says which object is meant; in its scene it must fit exactly one.
+
+    It is resolved when an episode begins: what was leftmost then is meant to the end.
+    """
+
+    color: str | None = None
+    """A key of `COLORS`; None: any."""
+    shape: str | None = None
+    """One of `SHAPES`; None: any."""
+    where: str | Relation | None = None
+    """A key of `EXTREMES`, or a relation such as `left_of(Ref("red"))`; None: any."""
+
+    def __post_init__(self) -> None:
+        """Check the fields.
+
+        Raises:
+            GoalError: There is no such color, shape or relation.
+        """
+        if self.color is not None:
+            _require_choice("color of a Ref", self.color, COLORS)
+        if self.shape is not None:
+            _require_choice("shape of a Ref", self.shape, SHAPES)
+        if not (self.where is None or isinstance(self.where, Relation)):
+            _require_choice("where of a Ref", self.where, EXTREMES)
+
+    def resolve(self, scene: Snapshot) -> Tensor:
+        """Return which objects fit, one or not, at the start of the episode [N, C]."""
+        fits = scene.color >= 0
+        if self.color is not None:
+            fits = fits & (scene.color == list(COLORS).index(self.color))
+        if self.shape is not None:
+            fits = fits & (scene.shape == SHAPES.index(self.shape))
+        if isinstance(self.where, Relation):
+            fits = fits & self.where.fits(scene)
+        elif self.where is not None:
+            axis, sign = EXTREMES[self.where]
+            rank = torch.where(fits, sign * scene.start[..., axis], -torch.inf)
+            fits = fits & (rank == rank.amax(dim=1, keepdim=True))
+        return fits
+
+
+# -- Measures --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Measure:
+    """How far a goal is reached in N scenes, and what it allows."""
+
+    holds: Tensor
+    """Whether the goal is reached now [N] bool."""
+    gap: Tensor
+    """How far it is from that, 0 where it holds [N] [m]."""
+    serves: Tensor
+    """Which contacts serve it; any other contact is a foul. Where no contact does,
+    none is a foul but those in `bars` [N, F, C] bool."""
+    bars: Tensor = None  # type: ignore[assignment]
+    """Which contacts are a foul in any case [N, F, C] bool; None: none."""
+    level: Tensor = None  # type: ignore[assignment]
+    """How much of it is reached: what the reward counts [N]; None: 1 where it holds."""
+    still: Tensor = None  # type: ignore[assignment]
+    """Objects whose motion the dense reward penalizes [N, C] bool; None: none."""
+    may_move: Tensor = None  # type: ignore[assignment]
+    """Objects that may be moved; moving others is a foul [N, C] bool; None: all."""
+    stage: Tensor = None  # type: ignore[assignment]
+    """How many goals of a sequence `Then` are reached [N] int64; None: 0."""
+
+    def __post_init__(self) -> None:
+        """Put in what was left out."""
+        objects = self.serves[:, 0]  # [N, C]
+        defaults = {
+            "bars": lambda: torch.zeros_like(self.serves),
+            "level": self.holds.float,
+            "still": lambda: torch.zeros_like(objects),
+            "may_move": lambda: torch.ones_like(objects),
+            "stage": lambda: torch.zeros_like(self.holds, dtype=torch.int64),
+        }
+        for name, make in defaults.items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, make())
+
+    @staticmethod
+    def where(chosen: Tensor, first: Measure, second: Measure) -> Measure:
+        """Return the first measure in the scenes chosen [N] bool, else the second."""
+        pairs = {
+            f.name: (getattr(first, f.name), getattr(second, f.name))
+            for f in fields(Measure)
+        }
+        return Measure(
+            **{
+                name: torch.where(chosen.view(-1, *[1] * (a.ndim - 1)), a, b)
+                for name, (a, b) in pairs.items()
+            }
+        )
+
+
+# -- Goals -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Goal(ABC):
+    """What a sentence asks for. A subclass is a verb: its fields, and `measure`."""
+
+    @staticmethod
+    @abstractmethod
+    def measure(scene: Snapshot, asked: SimpleNamespace) -> Measure:
+        """Measure N scenes.
+
+        Args:
+            scene: The scenes.
+            asked: Goals of this kind, one for each scene, their fields stacked as the
+                module's table says.
+        """
+
+    @property
+    def parts(self) -> tuple[Goal, ...]:
+        """The goals that this one is made of."""
+        values = (getattr(self, f.name) for f in fields(self))
+        return tuple(value for value in values if isinstance(value, Goal))
+
+    @property
+    def refs(self) -> tuple[Ref, ...]:
+        """All references in it and its parts."""
+        values = (getattr(self, f.name) for f in fields(self))
+        own = tuple(value for value in values if isinstance(value, Ref))
+        return own + tuple(ref for part in self.parts for ref in part.refs)
+
+    def _check(self, **kinds: type) -> None:
+        for name, kind in kinds.items():
+            if not isinstance(got := getattr(self, name), kind):
+                raise GoalError(
+                    f"{name} of {type(self).__name__}: got {got!r}, "
+                    f"expected a {kind.__name__}"
+                )
+
+
+def nearest(scene: Snapshot, serves: Tensor) -> Tensor:
+    """Return the distance from the nearest fingertip that may touch [N] [m].
+
+    Args:
+        scene: The scenes.
+        serves: Which finger may touch which object [N, F, C] bool.
+    """
+    return scene.distance.where(serves, torch.inf).flatten(1).amin(dim=1)
+
+
+@dataclass(frozen=True)
+class Touch(Goal):
+    """Touch an object: "Touch the blue cube.", "... with your left hand."."""
+
+    ref: Ref
+    """Which object."""
+    hand: str | None = None
+    """With which of the robot's hands; None: any."""
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        self._check(ref=Ref)
+
+    @staticmethod
+    def measure(scene: Snapshot, asked: SimpleNamespace) -> Measure:
+        """Hold while a finger is on the object; the level counts such fingers."""
+        serves = asked.hand[:, :, None] & asked.ref[:, None]  # [N, F, C]
+        fingers = (scene.contact & serves).any(dim=2).sum(dim=1)  # [N]
+        holds = fingers > 0
+        gap = nearest(scene, serves).masked_fill(holds, 0.0)
+        return Measure(holds, gap, serves, level=fingers.float(), still=asked.ref)
+
+
+@dataclass(frozen=True)
+class Push(Goal):
+    """Push an object so far: "Push the red cube to the left."."""
+
+    ref: Ref
+    """Which object."""
+    direction: str
+    """A key of `DIRECTIONS`."""
+    distance: float = 0.05
+    """How far [m]."""
+
+    STRAIGHT = 0.6
+    """Largest share of the way that it may stray to the side."""
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        self._check(ref=Ref, distance=Real)
+        _require_choice("direction of Push", self.direction, DIRECTIONS)
+        if not 0 < self.distance <= 0.5:
+            raise GoalError(f"distance of Push: got {self.distance}, expected 0 to 0.5")
+
+    @staticmethod
+    def measure(scene: Snapshot, asked: SimpleNamespace) -> Measure:
+        """Hold where the object is so far that way, and not far to the side."""
+        moved = (scene.moved * asked.ref[..., None]).sum(dim=1)  # [N, 3]
+        along = (moved * asked.direction).sum(dim=1)  # [N]
+        aside = (moved - along[:, None] * asked.direction)[:, :2].norm(dim=1)
+        holds = (along >= asked.distance) & (aside <= Push.STRAIGHT * along)
+        strayed = (aside - Push.STRAIGHT * along.clamp(min=0)).clamp(min=0)
+        gap = ((asked.distance - along).clamp(min=0) + strayed).masked_fill(holds, 0.0)
+        progress = (along / asked.distance).clamp(-1, 1)
+        serves = asked.ref[:, None].expand_as(scene.contact)
+        return Measure(holds, gap, serves, level=progress, may_move=asked.ref)
+
+
+@dataclass(frozen=True)
+class Avoid(Goal):
+    """Leave an object alone: "... but not the red one."."""
+
+    ref: Ref
+    """Which object."""
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        self._check(ref=Ref)
+
+    @staticmethod
+    def measure(scene: Snapshot, asked: SimpleNamespace) -> Measure:
+        """Hold while no finger is on the object."""
+        bars = asked.ref[:, None].expand_as(scene.contact)
+        holds = ~(scene.contact & bars).flatten(1).any(dim=1)
+        gap = torch.where(holds, 0.0, MOVED)
+        level = torch.zeros_like(gap)
+        return Measure(holds, gap, torch.zeros_like(bars), bars=bars, level=level)
+
+
+@dataclass(frozen=True)
+class Both(Goal):
+    """Two goals at the same time."""
+
+    a: Goal
+    """The one."""
+    b: Goal
+    """The other."""
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        self._check(a=Goal, b=Goal)
+        if any(map(_is_sequence, self.parts)):
+            raise GoalError("Both: got a Then in it, expected a Then around it")
+
+    @staticmethod
+    def measure(scene: Snapshot, asked: SimpleNamespace) -> Measure:
+        """Hold where both do; contacts serve that serve either."""
+        a, b = asked.a.measure(scene), asked.b.measure(scene)
+        return Measure(
+            holds=a.holds & b.holds,
+            gap=torch.maximum(a.gap, b.gap),
+            serves=a.serves | b.serves,
+            bars=a.bars | b.bars,
+            level=a.level + b.level,
+            still=a.still | b.still,
+            may_move=a.may_move | b.may_move,
+        )
+
+
+@dataclass(frozen=True)
+class Then(Goal):
+    """Two goals in this order; `b` counts from the step after `a` was reached."""
+
+    a: Goal
+    """The first; no sequence itself."""
+    b: Goal
+    """The second; it may be a sequence."""
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        self._check(a=Goal, b=Goal)
+        if _is_sequence(self.a):
+            raise GoalError("Then: got a Then as `a`, expected it as `b`")
+
+    @staticmethod
+    def measure(scene: Snapshot, asked: SimpleNamespace) -> Measure:
+        """Hold where `a` was reached before and `b` holds now."""
+        later = scene.stage > 0  # [N]
+        a = asked.a.measure(scene)
+        b = asked.b.measure(scene.at_stage((scene.stage - 1).clamp(min=0)))
+        first = dataclasses.replace(
+            a, holds=torch.zeros_like(later), stage=a.holds.long()
+        )
+        second = dataclasses.replace(
+            b,
+            serves=a.serves | b.serves,  # the hand is still where it was sent first
+            level=1 + b.level,
+            may_move=a.may_move | b.may_move,
+            stage=1 + b.stage,
+        )
+        return Measure.where(later, second, first)
+
+
+def _is_sequence(goal: Goal) -> bool:
+    return isinstance(goal, Then) or any(map(_is_sequence, goal.parts))
