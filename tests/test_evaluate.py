@@ -45,6 +45,7 @@ class ScriptedEnvs:
         self.once |= right > 0
         self.wrong_once |= wrong > 0
         info = {
+            "success": right > 0,
             "right_fingers": right,
             "wrong_fingers": wrong,
             "success_once": self.once.clone(),
@@ -111,13 +112,13 @@ def test_scores_are_those_worked_out_by_hand():
     blue = report.instructions[SENTENCES[0]]
     assert (blue.success.count, blue.success.total) == (4, 6)
     assert blue.exclusive.count == 4
-    assert blue.touching == pytest.approx(4 / 6 * 3 / 4)
+    assert blue.holding == pytest.approx(4 / 6 * 3 / 4)
     assert blue.right_fingers == pytest.approx((2 + 2 + 1 + 1) * 3 / (6 * 4))
     assert blue.wrong_fingers == 0
     assert blue.mean_return == pytest.approx(4 * 3 / 6)
     # Odd seeds touch a wrong object once, and red never.
     red = report.instructions[SENTENCES[1]]
-    assert (red.success.count, red.touching) == (0, 0)
+    assert (red.success.count, red.holding) == (0, 0)
     assert red.wrong_fingers == pytest.approx(1 / 4)
     assert report.overall.success.value == pytest.approx(4 / 12)
 

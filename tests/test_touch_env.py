@@ -121,9 +121,7 @@ def test_the_sentence_its_tokens_and_its_object_belong_together(env: gym.Env) ->
         words = [catalog.VOCABULARY[token] for token in obs["extra"]["instruction"][0]]
         assert words == instruction.text.lower().replace(".", " .").split()
     for wrong in (3, True, 1.5, "Touch the sky.", [0.0], float):
-        with pytest.raises(
-            ValueError, match="'instruction': got .* expected s"
-        ):
+        with pytest.raises(ValueError, match="'instruction': got .* expected s"):
             env.reset(options={"instruction": wrong})
     with pytest.raises(ValueError, match=r"got \[0, 0\].* or one for each of 1: "):
         env.reset(options={"instruction": [0, 0]})

@@ -153,6 +153,55 @@ def test_other_names_and_empty_videos_are_refused(tmp_path):
         write_video(tmp_path / "a.gif", [])
 
 
+def test_letters_of_other_alphabets_are_no_boxes():
+    heads = []
+    for text in ("\u00dc", "\u0416", "\u03a9", "\uffff"):  # the last has no glyph
+        shown = Snapshot(**{**vars(snapshot()), "instruction": text})
+        heads.append(draw(shown)[46:90, 30:80].tobytes())
+    assert len(set(heads)) == 4
+
+
+def test_a_long_sentence_stays_beside_the_legend():
+    long = Snapshot(**{**vars(snapshot()), "instruction": "Touch the cube. " * 8})
+    x, y = video.LEGEND
+    here, usual = draw(long), draw(snapshot())
+    assert np.array_equal(
+        here[y - 30 : y + 30, x - 4 :], usual[y - 30 : y + 30, x - 4 :]
+    )
+
+
+def test_an_episode_of_more_steps_than_pixels_can_be_drawn():
+    steps = 10_000
+    shot = snapshot(step=steps, history=((True, False),) * steps)
+    frame = draw(Snapshot(**{**vars(shot), "total_steps": steps}))
+    assert share(frame, video.TIMELINE, RIGHT) > 0.95
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.gif", "A.GIF"])
+def test_a_film_that_fails_leaves_the_older_one(name, tmp_path):
+    path = tmp_path / name
+    path.write_bytes(b"older")
+
+    def broken():
+        yield snapshot()
+        raise RuntimeError("the simulation failed")
+
+    with pytest.raises(RuntimeError, match="simulation failed"):
+        write_video(path, broken())
+    assert path.read_bytes() == b"older"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_film_that_ffmpeg_cut_short_is_an_error(tmp_path, monkeypatch):
+    path = tmp_path / "a.mp4"
+    count = video.imageio_ffmpeg.count_frames_and_secs
+    fewer = lambda name: (count(name)[0] - 1, 0.0)  # noqa: E731
+    monkeypatch.setattr(video.imageio_ffmpeg, "count_frames_and_secs", fewer)
+    with pytest.raises(OSError, match="cannot write .*a.mp4: ffmpeg did not write all"):
+        write_video(path, [snapshot()])
+    assert not path.exists()
+
+
 def test_a_film_of_no_instruction_is_refused():
     blind = {"obs_mode": "state_dict", "render_backend": "none"}
     films = video.record(
@@ -185,7 +234,7 @@ def test_the_video_shows_the_evaluated_episode(multi_vec, reflex, env_kwargs):
     seen = shots[1:]
     assert sum(sum(s.right) for s in seen) == round(32 * report.overall.right_fingers)
     touched = [right for right, _ in shots[-1].history]
-    assert np.mean(touched) == pytest.approx(report.overall.touching)
+    assert np.mean(touched) == pytest.approx(report.overall.holding)
     assert all(shot.view.std() > 20 and shot.cameras[0].std() > 20 for shot in shots)
 
 

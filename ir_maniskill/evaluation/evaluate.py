@@ -1,4 +1,4 @@
-"""Evaluation: how reliably a policy touches what the sentence names.
+"""Evaluation: how reliably a policy does what the sentence asks, and nothing else.
 
 Every episode is pinned by a seed of its own, and the policy acts on each env alone, so
 the figures depend on neither the number of envs nor the order of the episodes.
@@ -26,6 +26,7 @@ from tqdm import tqdm
 
 from ir_maniskill.environment.state import State, StateStack
 from ir_maniskill.environment.vector import VectorEnv, make_vec
+from ir_maniskill.files import replacing
 
 Policy = Callable[[State], Tensor]
 """Maps the state s_t of N envs to their actions [N, 26] in [-1, 1]."""
@@ -83,15 +84,15 @@ class Score:
     """What the policy did over a set of episodes."""
 
     success: Rate
-    """Episodes in which the named object was touched."""
+    """Episodes in which the goal was reached."""
     exclusive: Rate
-    """Episodes in which it was, and no other object at any step."""
-    touching: float
-    """Share of steps in which the named object is touched."""
+    """Episodes in which it was, without a foul at any step."""
+    holding: float
+    """Share of steps in which the goal holds."""
     right_fingers: float
-    """Fingers on the named object, mean over steps."""
+    """Fingers that touch as the goal asks, mean over steps."""
     wrong_fingers: float
-    """Fingers on other objects, mean over steps."""
+    """Fingers that touch as it does not allow, mean over steps."""
     mean_return: float
     """Sum of the rewards of an episode, mean over episodes."""
 
@@ -101,7 +102,7 @@ class Score:
             "episodes": self.success.total,
             **self.success.as_dict("success"),
             **self.exclusive.as_dict("exclusive"),
-            "touching": self.touching,
+            "holding": self.holding,
             "right_fingers": self.right_fingers,
             "wrong_fingers": self.wrong_fingers,
             "return": self.mean_return,
@@ -140,7 +141,7 @@ class EvaluationReport:
         width = max(len(name) for name, _ in rows)
         head = (
             f"{'instruction':<{width}}     N  success [95%]         "
-            "exclusive [95%]       touching  fingers right/wrong  return"
+            "exclusive [95%]        holding  fingers right/wrong  return"
         )
         return "\n".join([head, *(_row(name, score, width) for name, score in rows)])
 
@@ -158,7 +159,7 @@ class SceneReport:
     seed: int
     """Seed of the first scene; scene e has seed + e."""
     exclusive: Rate
-    """Scenes in which it touched the named object alone, for every sentence."""
+    """Scenes in which it did what was asked without a foul, for every sentence."""
     pairs: dict[tuple[str, str], Rate]
     """The same for every two sentences."""
 
@@ -179,7 +180,7 @@ class SceneReport:
 def _row(name: str, score: Score, width: int) -> str:
     return (
         f"{name:<{width}} {score.success.total:>5}  {score.success!s:<20}  "
-        f"{score.exclusive!s:<20}  {100 * score.touching:>7.1f}%  "
+        f"{score.exclusive!s:<20}  {100 * score.holding:>7.1f}%  "
         f"{score.right_fingers:>11.2f} / {score.wrong_fingers:<5.2f}  "
         f"{score.mean_return:>6.2f}"
     )
@@ -194,7 +195,7 @@ class _Record:
     exclusive: Tensor = field(init=False)  # [E]
     sums: Tensor = field(init=False)  # [E, 5]: see SUMS
 
-    SUMS = ("steps", "touching", "right_fingers", "wrong_fingers", "return")
+    SUMS = ("steps", "holding", "right_fingers", "wrong_fingers", "return")
 
     def __post_init__(self) -> None:
         self.success = torch.zeros(self.episodes, dtype=torch.bool)
@@ -205,11 +206,9 @@ class _Record:
         self, episode: Tensor, env: Tensor, reward: Tensor, info: dict[str, Tensor]
     ) -> None:
         """Count one step of the episodes that the chosen envs play."""
-        right, wrong = (
-            info["right_fingers"][env].cpu(),
-            info["wrong_fingers"][env].cpu(),
-        )
-        step = (torch.ones_like(right), right > 0, right, wrong, reward[env].cpu())
+        names = ("success", "right_fingers", "wrong_fingers")
+        holds, right, wrong = (info[name][env].cpu() for name in names)
+        step = (torch.ones_like(right), holds, right, wrong, reward[env].cpu())
         self.sums[episode] += torch.stack([x.double() for x in step], dim=1)
         self.success[episode] = info["success_once"][env].cpu()
         self.exclusive[episode] = info["exclusive_success"][env].cpu()
@@ -221,7 +220,7 @@ class _Record:
         return Score(
             success=Rate(int(self.success[chosen].sum()), total),
             exclusive=Rate(int(self.exclusive[chosen].sum()), total),
-            touching=sums["touching"] / sums["steps"],
+            holding=sums["holding"] / sums["steps"],
             right_fingers=sums["right_fingers"] / sums["steps"],
             wrong_fingers=sums["wrong_fingers"] / sums["steps"],
             mean_return=sums["return"] / total,
@@ -241,7 +240,7 @@ def evaluate_policy(
     instructions: Sequence[int] | None = None,
     progress: bool = False,
 ) -> EvaluationReport:
-    """Play episodes with a policy and count what it touches.
+    """Play episodes with a policy and count what it does.
 
     Episodes are spread evenly over the instructions: episode e is told instruction
     e modulo their number, and starts from seed + e.
@@ -340,8 +339,8 @@ def write_report(path: Path, report: EvaluationReport, **facts: Any) -> None:
         **facts: More to write down: the checkpoint, the configuration, ...
     """
     data = {**report.as_dict(), **facts, "versions": versions(), "machine": machine()}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
+    with replacing(path) as aside:
+        aside.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
 
 
 def versions() -> dict[str, str]:

@@ -7,6 +7,7 @@ and the counters.
 
 from __future__ import annotations
 
+import errno
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
@@ -17,14 +18,17 @@ from typing import Any
 
 import gymnasium as gym
 import imageio.v2 as imageio
+import imageio_ffmpeg
 import numpy as np
 import torch
 from mani_skill.utils.sapien_utils import look_at
+from matplotlib import font_manager
 from PIL import Image, ImageDraw, ImageFont
 
 from ir_maniskill.environment.state import CAMERAS, StateStack
 from ir_maniskill.environment.touch_env import CONTROL_FREQ
 from ir_maniskill.evaluation.evaluate import Policy, choose_instructions, one_thread
+from ir_maniskill.files import replacing
 
 Box = tuple[int, int, int, int]
 """Left, top, width and height [pixel]."""
@@ -73,9 +77,9 @@ class Snapshot:
     fingers: tuple[str, ...]
     """Names of the robot's F fingers."""
     right: tuple[bool, ...]
-    """Which of the F fingers are on the named object."""
+    """Which of the F fingers touch as the sentence asks."""
     wrong: tuple[bool, ...]
-    """Which of the F fingers are on another."""
+    """Which of the F fingers touch as it does not allow."""
     step: int
     """Steps since the episode began."""
     total_steps: int
@@ -83,7 +87,7 @@ class Snapshot:
     score: float
     """Sum of the rewards so far."""
     history: tuple[tuple[bool, bool], ...]
-    """For each step so far: whether the named object was touched, and another."""
+    """For each step so far: whether the goal held, and whether there was a foul."""
 
 
 def record(
@@ -181,11 +185,11 @@ def _play(
         if step < total:
             with one_thread():
                 action = policy(state)
-            obs, reward, *_ = env.step(action)
+            obs, reward, _, _, info = env.step(action)
             state, score = stack.push(obs), score + float(reward)
             verdict = base.verdict
             right, wrong = verdict.right[0].tolist(), verdict.wrong[0].tolist()
-            history += ((any(right), any(wrong)),)
+            history += ((bool(info["success"]), bool(verdict.foul)),)
 
 
 def _picture(tensor: Any) -> np.ndarray:
@@ -211,7 +215,8 @@ def draw(snapshot: Snapshot) -> np.ndarray:
     for picture, box in zip(snapshot.cameras, boxes, strict=False):
         _paste(page, picture, box, radius=10)
     canvas = ImageDraw.Draw(page)
-    canvas.text((32, 46), snapshot.instruction, INK, _font(34))
+    font = _fitting(snapshot.instruction, LEGEND[0] - 60, 34)
+    canvas.text((32, 66), snapshot.instruction, INK, font, anchor="lm")
     _label_cameras(canvas, snapshot.cameras, boxes)
     _draw_timeline(canvas, snapshot)
     _draw_hands(page, snapshot)
@@ -221,7 +226,14 @@ def draw(snapshot: Snapshot) -> np.ndarray:
 
 @cache
 def _font(size: int) -> Any:
-    return ImageFont.load_default(size)
+    """Return a font with the letters of most alphabets, which Matplotlib brings."""
+    return ImageFont.truetype(font_manager.findfont("DejaVu Sans"), size)
+
+
+def _fitting(text: str, width: int, size: int) -> Any:
+    """Return the largest font up to `size` in which the text is not wider [pixel]."""
+    sizes = range(size, 11, -1)
+    return _font(next((s for s in sizes if _font(s).getlength(text) <= width), 11))
 
 
 @cache
@@ -233,7 +245,7 @@ def _page() -> Image.Image:
     for box in (HANDS, COUNTERS):
         _paste_shape(page, box, CARD, radius=10)
     x, y = LEGEND
-    for color, text in ((RIGHT, "touches the named object"), (WRONG, "another one")):
+    for color, text in ((RIGHT, "as the sentence asks"), (WRONG, "not allowed")):
         _paste_shape(page, (x, y, 12, 12), color, radius=6)
         canvas.text((x + 20, y + 6), text, FAINT, _font(13), anchor="lm")
         x += 212
@@ -286,13 +298,15 @@ def _paste_shape(page: Image.Image, box: Box, color: Color, radius: int) -> None
 
 
 def _draw_timeline(canvas: ImageDraw.ImageDraw, snapshot: Snapshot) -> None:
-    """Draw one cell a step: green above if right, red below if wrong, else gray."""
+    """Draw one cell a step: green above if the goal holds, red below if a foul."""
     x, y, width, height = TIMELINE
     total = snapshot.total_steps
     gap = 3 if total <= 100 else 0
     cell = (width + gap) / total
     for step in range(total):
         left, end = round(x + step * cell), round(x + (step + 1) * cell) - gap - 1
+        if end < left:  # more steps than pixels: the next one takes its place
+            continue
         upper = lower = CARD
         if step < len(snapshot.history):
             right, wrong = snapshot.history[step]
@@ -384,7 +398,6 @@ def write_video(
         ValueError: The name ends in neither .mp4 nor .gif, or there is nothing to show.
     """
     check_name(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     rate = CONTROL_FREQ * speed
     count = 0
 
@@ -395,18 +408,19 @@ def write_video(
             count += 1
             yield from [frame] * (1 + round(hold * rate) * last)
 
-    write = _write_gif if path.suffix == ".gif" else _write_mp4
-    write(path, frames(), rate)
-    if count == 0:
-        raise ValueError(
-            f"video: got no frames for {path}, expected at least one episode"
-        )
+    write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
+    with replacing(path) as aside:
+        write(aside, frames(), rate)
+        if count == 0:
+            raise ValueError(
+                f"video: got no frames for {path}, expected at least one episode"
+            )
     return count
 
 
 def check_name(path: Path) -> None:
     """Raise ValueError unless the name ends in .mp4 or .gif."""
-    if path.suffix not in (".mp4", ".gif"):
+    if path.suffix.lower() not in (".mp4", ".gif"):
         raise ValueError(f"video: got {path}, expected a name ending in .mp4 or .gif")
 
 
@@ -422,9 +436,14 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
         output_params=tuning,
         **options,
     )
-    with writer:
+    written = 0
+    with closing(writer):  # used as a context by itself, an error would leave it open
         for frame in frames:
             writer.append_data(frame)
+            written += 1
+    # ffmpeg says nothing of a disk that was full; a film that is cut has fewer frames.
+    if written and imageio_ffmpeg.count_frames_and_secs(str(path))[0] != written:
+        raise OSError(errno.EIO, "ffmpeg did not write all frames")
 
 
 def _palette(images: Sequence[Image.Image]) -> Image.Image:

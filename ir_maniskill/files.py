@@ -1,0 +1,35 @@
+"""Files are written aside and renamed: only success replaces what was there before."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a new file's path beside `path`; at the end it takes the place of `path`.
+
+    Args:
+        path: The file to write. Its folder is made if need be.
+
+    Raises:
+        OSError: It cannot be written; the file there before is untouched.
+    """
+    aside = path.with_name(f".{os.getpid()}.{path.name}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield aside
+        with aside.open("rb") as file:
+            os.fsync(file.fileno())
+        aside.replace(path)
+    except OSError as error:
+        reason = error.strerror or error
+        raise OSError(
+            f"cannot write {path}: {reason}; free some space or choose another folder "
+            "(what was there before is intact)"
+        ) from error
+    finally:
+        aside.unlink(missing_ok=True)
