@@ -1,35 +1,33 @@
 """CPU vector env: worker processes that each step several envs.
 
 Observations, rewards and infos cross process borders in one block of shared memory;
-pipes carry only commands. Legend: N envs.
+pipes carry only commands. Legend: N envs, J joints.
 """
 
 from __future__ import annotations
 
 import contextlib
-import gc
 import multiprocessing as mp
 import os
-import signal
-import time
-import traceback
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+import pickle
+import sys
+from collections.abc import Sequence
+from multiprocessing import reduction
 from multiprocessing.connection import Connection, wait
-from multiprocessing.shared_memory import SharedMemory
+from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
+from ir_maniskill.environment.arguments import actions_of, options_of, seeds_of
+from ir_maniskill.environment.host_tensor import HostTensor
+from ir_maniskill.environment.shared_rows import SharedRows, Tree, map_leaves, reserve
+from ir_maniskill.environment.worker import ENDS, work
 from ir_maniskill.experiment import Experiment
-
-Tree = dict[str, Any]
-"""Nested dicts with tensors or arrays as leaves."""
 
 Observation = Any
 """A tree, or in obs_mode "state" one tensor: what a single env gives."""
@@ -40,91 +38,12 @@ Step = tuple[Observation, Tensor, Tensor, Tensor, Tree]
 FIRST_SEED = 2022
 """Seed of the first reset if it has none, as of ManiSkill's own envs."""
 
+GRACE = 5.0
+"""How long workers that wait for a command may take to end [s]."""
+
 
 class WorkerError(RuntimeError):
-    """A worker process failed, died or hangs; the message names it."""
-
-
-@dataclass(frozen=True)
-class _Leaf:
-    """One array in the shared block."""
-
-    path: tuple[str, ...]
-    shape: tuple[int, ...]
-    dtype: str
-    offset: int
-
-
-class _SharedTree:
-    """Named arrays [N, ...] in one block of shared memory."""
-
-    ALIGNMENT = 64
-
-    def __init__(self, leaves: list[_Leaf], memory: SharedMemory) -> None:
-        self.leaves, self._memory = leaves, memory
-        self.arrays = {
-            leaf.path: np.ndarray(
-                leaf.shape, leaf.dtype, buffer=memory.buf, offset=leaf.offset
-            )
-            for leaf in leaves
-        }
-
-    @classmethod
-    def create(cls, sample: Tree, num_envs: int) -> _SharedTree:
-        """Make room for N rows of every leaf of `sample`, whose leaves have one."""
-        leaves, offset = [], 0
-        for path, value in _walk(sample):
-            shape = (num_envs, *value.shape[1:])
-            leaves.append(_Leaf(path, shape, value.dtype.str, offset))
-            size = int(np.prod(shape)) * value.dtype.itemsize
-            offset += -(-size // cls.ALIGNMENT) * cls.ALIGNMENT
-        return cls(leaves, SharedMemory(create=True, size=max(offset, 1)))
-
-    @property
-    def address(self) -> tuple[list[_Leaf], str]:
-        """What another process needs to `attach`."""
-        return self.leaves, self._memory.name
-
-    @classmethod
-    def attach(cls, address: tuple[list[_Leaf], str]) -> _SharedTree:
-        leaves, name = address
-        return cls(leaves, SharedMemory(name=name))
-
-    def write(self, row: int, tree: Tree) -> None:
-        """Copy the one row of `tree` to `row`."""
-        for path, value in _walk(tree):
-            self.arrays[path][row] = value[0]
-
-    def read(self, *prefix: str) -> Any:
-        """Return copies of the leaf at `prefix`, or, nested, of all below it."""
-        if prefix in self.arrays:
-            return torch.from_numpy(self.arrays[prefix].copy())
-        tree: Tree = {}
-        for path, array in self.arrays.items():
-            if path[: len(prefix)] == prefix:
-                *parents, name = path[len(prefix) :]
-                node = tree
-                for parent in parents:
-                    node = node.setdefault(parent, {})
-                node[name] = torch.from_numpy(array.copy())
-        return tree
-
-    def close(self, unlink: bool) -> None:
-        self.arrays.clear()
-        self._memory.close()
-        if unlink:
-            self._memory.unlink()
-
-
-def _walk(tree: Tree, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple, np.ndarray]]:
-    """Yield (path, array) of every tensor or array leaf."""
-    for name, value in tree.items():
-        if isinstance(value, dict):
-            yield from _walk(value, (*path, name))
-        elif isinstance(value, Tensor):
-            yield (*path, name), value.numpy()
-        elif isinstance(value, np.ndarray):
-            yield (*path, name), value
+    """Worker processes cannot be started, or one failed, died or hangs."""
 
 
 class ProcessVectorEnv(VectorEnv):
@@ -135,7 +54,7 @@ class ProcessVectorEnv(VectorEnv):
     """
 
     device = torch.device("cpu")
-    _shared: _SharedTree
+    _shared: SharedRows
 
     def __init__(
         self,
@@ -157,7 +76,9 @@ class ProcessVectorEnv(VectorEnv):
             timeout: How long a worker may take for one command [s].
 
         Raises:
-            WorkerError: A worker could not make its envs.
+            WorkerError: Processes cannot be started from here, or a worker could not
+                make its envs.
+            OSError: There is too little shared memory.
         """
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
         cores = len(os.sched_getaffinity(0))
@@ -171,39 +92,53 @@ class ProcessVectorEnv(VectorEnv):
         self._busy = False
         """Whether answers to a command are still to come."""
         try:
-            self._start(env_kwargs or {})
-            self._connect()
+            _require_main()
+            self._start()
+            self._make(env_kwargs or {})
         except BaseException:
             self.close()
             raise
 
-    def _start(self, env_kwargs: dict[str, Any]) -> None:
-        """Start the workers, which make their envs and describe them."""
+    def _start(self) -> None:
         context = mp.get_context("forkserver")
         context.set_forkserver_preload(["ir_maniskill"])
-        for index, rows in enumerate(self._rows):
-            ours, theirs = context.Pipe()
-            process = context.Process(
-                target=_work,
-                args=(theirs, self.experiment, rows, env_kwargs, dict(os.environ)),
-                name=f"ir-maniskill-worker-{index}",
-                daemon=True,
-            )
-            process.start()
+        for index in range(len(self._rows)):
+            name = f"ir-maniskill-worker-{index}"
+            try:
+                ours, theirs = context.Pipe()
+                process = context.Process(
+                    target=work,
+                    args=(theirs, dict(os.environ)),
+                    name=name,
+                    daemon=True,
+                )
+                process.start()
+            except OSError as error:
+                short = "AF_UNIX" in str(error)  # the name of a socket has 107 letters
+                hint = "; set TMPDIR, where sockets are, to a shorter path"
+                raise WorkerError(
+                    f"cannot start {name} of {len(self._rows)} workers: {error}"
+                    + short * hint
+                ) from error
             theirs.close()
             self._pipes.append(ours)
             self._processes.append(process)
 
-    def _connect(self) -> None:
-        """Learn the spaces from the workers and lay out the shared memory."""
-        samples = self._gather()
-        sample, self.single_observation_space, self.single_action_space = samples[0]
-        self.observation_space = batch_space(
-            self.single_observation_space, self.num_envs
+    def _make(self, env_kwargs: dict[str, Any]) -> None:
+        """Have the envs made, learn their spaces and hand out the shared memory."""
+        makes = [(self.experiment, rows, env_kwargs) for rows in self._rows]
+        record, *spaces = self._command("make", makes)[0]
+        self.single_observation_space, self.single_action_space = spaces
+        self.observation_space, self.action_space = (
+            batch_space(space, self.num_envs) for space in spaces
         )
-        self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._shared = _SharedTree.create(sample, self.num_envs)
-        self._command("attach", [self._shared.address] * len(self._pipes))
+        with reserve(self.num_envs * record.itemsize) as file:
+            self._shared = SharedRows(file.fileno(), record, self.num_envs)
+            self._send("attach", [(record, self.num_envs)] * len(self._pipes))
+            for pipe, process in zip(self._pipes, self._processes, strict=True):
+                with contextlib.suppress(OSError):  # `_gather` tells who died
+                    reduction.send_handle(pipe, file.fileno(), process.pid)
+            self._gather()
 
     # -- VectorEnv -------------------------------------------------------------------
 
@@ -218,25 +153,27 @@ class ProcessVectorEnv(VectorEnv):
         Args:
             seed: Env i gets seed + i, or the i-th of a list; None goes on with each
                 env's own random stream, which begins with 2022 + i.
-            options: Passed to the envs; a list, array or tensor of N values is dealt
-                out, one each, and so are states of N rows ("reset_to_env_states").
+            options: "instruction": an index or a sentence for all envs, or a list,
+                array or tensor of N; "reconfigure": a bool; "reset_to_env_states":
+                states of N rows, or of one for all.
 
         Raises:
-            ValueError: There are not N seeds, values of an option or rows of a state,
-                or the options name some of the envs.
-            WorkerError: A worker refused an option, failed, died or hangs; or it has
+            ValueError: A seed or an option cannot be used; no env has been reset.
+            WorkerError: A worker failed (another reset may do), died or hangs, or has
                 not answered the last command.
         """
-        if "env_idx" in (options or {}):
+        options = options or {}
+        if "env_idx" in options:
             raise ValueError(
-                "options: got 'env_idx', expected none: worker processes reset all "
-                "envs at once, and each by itself when its episode ends"
+                "reset options: got 'env_idx', expected none: worker processes reset "
+                "all envs at once, and each by itself when its episode ends"
             )
         if seed is None and not self._seeded:
             seed = FIRST_SEED
         count = self.num_envs
         seeds = [None] * count if seed is None else seeds_of(seed, count)
-        each = list(zip(seeds, _deal(options or {}, count), strict=True))
+        dealt = options_of(options, self.experiment.sentences, count)
+        each = list(zip(seeds, dealt, strict=True))
         self._command("reset", [[each[row] for row in rows] for rows in self._rows])
         self._seeded = True
         return self._shared.read("obs"), self._shared.read("info")
@@ -248,7 +185,8 @@ class ProcessVectorEnv(VectorEnv):
             actions: One row per env [N, J] in [-1, 1].
 
         Returns:
-            Observation, reward [N], terminated [N], truncated [N] and info.
+            Observation, reward [N], terminated [N], truncated [N] and info. Where an
+            episode ends, info has what `final_infos` says of it.
 
         Raises:
             ValueError: The actions have another shape or are not finite.
@@ -259,77 +197,62 @@ class ProcessVectorEnv(VectorEnv):
         return self.step_wait()
 
     def step_async(self, actions: Tensor | np.ndarray) -> None:
-        """Send the actions and return at once; `step_wait` must follow.
-
-        Args:
-            actions: One row per env [N, J] in [-1, 1].
-
-        Raises:
-            ValueError: The actions have another shape or are not finite.
-            WorkerError: A worker died, or has not answered the last command.
-        """
-        actions = np.asarray(actions, dtype=np.float32)
-        expected = self.action_space.shape
-        if actions.shape != expected:
-            raise ValueError(f"actions: got shape {actions.shape}, expected {expected}")
-        if not np.isfinite(actions).all():
-            raise ValueError("actions: got NaN or infinity, expected finite numbers")
+        """Send the actions and return at once; `step_wait` must follow."""
+        array = actions_of(actions, self.action_space.shape)
         self._require_idle()
-        self._shared.arrays["action",][:] = actions
+        self._shared.views["action"][:] = array
         self._send("step", [None] * len(self._pipes))
 
     def step_wait(self) -> Step:
-        """Wait for all workers and return what `step` returns.
-
-        Raises:
-            WorkerError: `step_async` was not called, or a worker failed, died or hangs.
-        """
+        """Wait for all workers and return what `step` returns."""
         if not self._busy:
             raise WorkerError("there is nothing to wait for: `step_async` comes first")
         self._gather()
-        shared = self._shared
-        now = shared.read("now")
-        info = shared.read("info")
-        done = now["terminated"] | now["truncated"]
+        read = self._shared.read
+        obs, info, *ends = map(read, ("obs", "info", "reward", *ENDS))
+        done = ends[1] | ends[2]
         if done.any():
-            info["final_observation"] = shared.read("final", "obs")
-            info["final_info"] = shared.read("final", "info")
-            info["_final_observation"] = info["_final_info"] = done
-        obs = shared.read("obs")
-        return obs, now["reward"], now["terminated"], now["truncated"], info
+            info |= final_infos(read("final_obs"), read("final_info"), done)
+        reward, terminated, truncated = (end.as_subclass(HostTensor) for end in ends)
+        return obs, reward, terminated, truncated, info
 
-    def set_attr(self, name: str, values: Any) -> None:
-        """Set an attribute of every env, such as "dense_weights".
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple:
+        """Call the method of every env, or get the attribute, of this name.
 
-        Args:
-            name: Of the attribute.
-            values: A list, array or tensor of N values, one each, or one for all.
+        Returns:
+            N results, copied from the workers.
 
         Raises:
-            ValueError: The list has not N values.
-            WorkerError: A worker died or hangs, or has not answered the last command.
+            ValueError: All envs have one method of that name, which is to be used.
+            WorkerError: There is none, it failed, or its result cannot be copied; or
+                a worker died or hangs, or has not answered the last command.
         """
-        each = _values(name, values, self.num_envs)
-        self._command(
-            "set_attr", [(name, [each[row] for row in rows]) for rows in self._rows]
-        )
+        if name in ("reset", "step", "close"):
+            raise ValueError(
+                f"call: got {name!r}, which is to be used for all: {name}()"
+            )
+        answers = self._command("call", [(name, args, kwargs)] * len(self._pipes))
+        return tuple(result for answer in answers for result in answer)
+
+    def get_attr(self, name: str) -> tuple:
+        """Return the attribute of each env (N values), as `call` does."""
+        return self.call(name)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Set an attribute of every env."""
+        self._command("set_attr", [(name, values)] * len(self._pipes))
 
     def close_extras(self, **kwargs: Any) -> None:
         """End all workers; none is left behind, whatever state it is in."""
         for pipe in self._pipes:
-            with contextlib.suppress(OSError):
-                pipe.send(("close", None))
-            pipe.close()
-        deadline = time.monotonic() + 5.0
+            pipe.close()  # which ends a worker that waits for a command
         for process in self._processes:
-            process.join(max(0.0, deadline - time.monotonic()))
+            process.join(0.0 if self._busy else GRACE)
             if process.is_alive():
                 process.kill()
                 process.join()
         self._pipes, self._processes = [], []
-        shared = self.__dict__.pop("_shared", None)
-        if shared is not None:
-            shared.close(unlink=True)
+        self.__dict__.pop("_shared", None)
 
     # -- Talking to the workers ------------------------------------------------------
 
@@ -350,40 +273,42 @@ class ProcessVectorEnv(VectorEnv):
             )
 
     def _send(self, name: str, arguments: list) -> None:
+        # Pickled here: pipes would pass each of torch's tensors as a file descriptor.
+        messages = [pickle.dumps((name, argument)) for argument in arguments]
         self._busy = True
-        for index, (pipe, argument) in enumerate(
-            zip(self._pipes, arguments, strict=True)
-        ):
+        for index, message in enumerate(messages):
             try:
-                pipe.send((name, argument))
+                self._pipes[index].send_bytes(message)
             except OSError:
                 raise self._died(index) from None
 
     def _gather(self) -> list:
         """Collect one answer from every worker."""
-        answers: list = [None] * len(self._pipes)
-        pending = set(range(len(self._pipes)))
+        answers: dict[int, bytes] = {}
         left = self._timeout
-        while pending:
-            # In short waits, for none to count an hour that all were stopped (Ctrl-Z).
-            brief, start = min(left, 1.0), time.monotonic()
-            ready = wait([self._pipes[index] for index in pending], brief)
-            left -= min(time.monotonic() - start, brief)
-            if not ready and left <= 0:
-                names = ", ".join(self._describe(index) for index in sorted(pending))
+        while len(answers) < len(self._pipes):
+            asked: dict[Any, int] = {
+                p: i for i, p in enumerate(self._pipes) if i not in answers
+            }
+            ready = wait(list(asked), min(left, 1.0))
+            # No clock: an hour in which all were stopped (Ctrl-Z) counts as a second.
+            left -= 0.0 if ready else 1.0
+            if left <= 0:
+                names = ", ".join(map(self._describe, asked.values()))
                 raise WorkerError(f"no answer within {self._timeout:g} s from {names}")
-            for index in [i for i in pending if self._pipes[i] in ready]:
-                pending.remove(index)
+            for pipe in [pipe for pipe in asked if pipe in ready]:
                 try:
-                    ok, answers[index] = self._pipes[index].recv()
+                    answers[asked[pipe]] = pipe.recv_bytes()
                 except (EOFError, OSError):
-                    raise self._died(index) from None
-                if not ok:
-                    raise WorkerError(
-                        f"{self._describe(index)} failed:\n{answers[index]}"
-                    )
+                    raise self._died(asked[pipe]) from None
         self._busy = False
-        return answers
+        results = []
+        for index in range(len(self._pipes)):
+            done, result = pickle.loads(answers[index])
+            if not done:
+                raise WorkerError(f"{self._describe(index)} failed:\n{result}")
+            results.append(result)
+        return results
 
     def _describe(self, index: int) -> str:
         rows = self._rows[index]
@@ -400,147 +325,40 @@ class ProcessVectorEnv(VectorEnv):
         )
 
 
-def seeds_of(seed: int | Sequence[int], num_envs: int) -> list[int]:
-    """Return the seeds of N envs: seed + i, or those of a sequence.
+def final_infos(obs: Observation, info: Tree, done: Tensor) -> Tree:
+    """Return what info says of ended episodes, under Gymnasium's and ManiSkill's names.
 
-    Raises:
-        ValueError: The sequence has not N of them.
+    Args:
+        obs: Last observations of the episodes.
+        info: Their last infos.
+        done: Whose episode has ended [N] bool; rows of the others are set to zero.
+
+    Returns:
+        `final_obs` and `final_observation` (the same tensors), `final_info`, and `done`
+        under each of these names with "_" before it.
     """
-    if isinstance(seed, int | np.integer):
-        return list(range(int(seed), int(seed) + num_envs))
-    if len(seed) != num_envs:
-        raise ValueError(f"seeds: got {len(seed)}, expected {num_envs}")
-    return [int(each) for each in seed]
+    going = (~done).nonzero()[:, 0]
+    for tree in (obs, info):
+        map_leaves(lambda leaf: leaf.index_fill_(0, going, 0), tree)
+    final = {"final_obs": obs, "final_observation": obs, "final_info": info}
+    return final | {f"_{name}": done for name in final}
 
 
-def _deal(options: dict[str, Any], num_envs: int) -> Iterator[dict[str, Any]]:
-    """Yield the options of each env: its own of N values, else what all get."""
-    values = {
-        name: _values(f"reset option {name!r}", given, num_envs)
-        for name, given in options.items()
-    }
-    for row in range(num_envs):
-        yield {name: value[row] for name, value in values.items()}
-
-
-def _values(what: str, given: Any, num_envs: int) -> list:
-    """Return each env's value of what is given for all or one each.
-
-    Of arrays of more dimensions, also in nested dicts, each gets its row [1, ...].
-    """
-    if isinstance(given, dict):
-        dealt = {
-            name: _values(f"{what}[{name!r}]", value, num_envs)
-            for name, value in given.items()
-        }
-        return [{name: dealt[name][row] for name in dealt} for row in range(num_envs)]
-    if isinstance(given, Tensor | np.ndarray):
-        given = np.asarray(given)
-        if given.ndim < 2:
-            given = given.tolist()
-        elif len(given) > 1:
-            given = list(given[:, None])
-    if not isinstance(given, list | tuple):
-        return [given] * num_envs
-    if len(given) != num_envs:
-        raise ValueError(
-            f"{what}: got {len(given)} values, expected {num_envs}, "
-            "one for each env, or a single one for all"
+def _require_main() -> None:
+    """Raise unless this process may have workers, and they can read its script."""
+    if mp.current_process().daemon:
+        raise WorkerError(
+            "cannot start workers: this is a daemonic process, such as one of "
+            "multiprocessing.Pool, which may have no others; "
+            "use concurrent.futures.ProcessPoolExecutor"
         )
-    return list(given)
-
-
-class _Worker:
-    """The envs of one process."""
-
-    _shared: _SharedTree
-
-    def __init__(
-        self, experiment: Experiment, rows: list[int], env_kwargs: dict[str, Any]
-    ) -> None:
-        from ir_maniskill.registration import register
-
-        register(experiment)
-        self._rows = rows
-        self._envs: list[Any] = [gym.make(experiment.id, **env_kwargs) for _ in rows]
-        # ManiSkill collects garbage whenever it rebuilds a scene, which seeded resets
-        # do; what is alive now stays alive, so there is no point in looking at it.
-        gc.freeze()
-
-    def describe(self) -> tuple[Tree, gym.Space, gym.Space]:
-        """Return a one-row sample of all that is shared, and the spaces."""
-        env = self._envs[0]
-        obs, info = env.reset(seed=0)
-        ends = {"terminated": np.zeros(1, bool), "truncated": np.zeros(1, bool)}
-        record = {"obs": obs, "info": info}
-        sample = {
-            **record,
-            "now": {"reward": np.zeros(1, np.float32), **ends},
-            "final": record,
-            "action": env.action_space.sample()[None],
-        }
-        space = env.unwrapped.single_observation_space
-        return sample, space, env.unwrapped.single_action_space
-
-    def attach(self, address: tuple) -> None:
-        """Open the shared memory."""
-        self._shared = _SharedTree.attach(address)
-
-    def reset(self, arguments: list[tuple]) -> None:
-        """Reset every env with its seed and options."""
-        for index, (seed, options) in enumerate(arguments):
-            self._reset(index, seed, options)
-
-    def _reset(self, index: int, seed: int | None, options: dict | None) -> None:
-        obs, info = self._envs[index].reset(seed=seed, options=options)
-        self._shared.write(self._rows[index], {"obs": obs, "info": info})
-
-    def set_attr(self, argument: tuple[str, list]) -> None:
-        """Set an attribute of every env."""
-        name, values = argument
-        for env, value in zip(self._envs, values, strict=True):
-            setattr(env.unwrapped, name, value)
-
-    def step(self, _: None) -> None:
-        """Step every env, and reset it if its episode is over."""
-        actions = self._shared.arrays["action",]
-        for index, (row, env) in enumerate(zip(self._rows, self._envs, strict=True)):
-            obs, reward, terminated, truncated, info = env.step(actions[row])
-            now = {"reward": reward, "terminated": terminated, "truncated": truncated}
-            record = {"obs": obs, "info": info}
-            self._shared.write(row, {"now": now})
-            if terminated or truncated:
-                self._shared.write(row, {"final": record})
-                self._reset(index, None, None)
-            else:
-                self._shared.write(row, record)
-
-
-def _work(
-    pipe: Connection,
-    experiment: Experiment,
-    rows: list[int],
-    env_kwargs: dict[str, Any],
-    environ: dict[str, str],
-) -> None:
-    """Run a worker: answer commands until told to close or the parent is gone."""
-    # The server that forks workers has those of the time when it was started.
-    os.environ.clear()
-    os.environ.update(environ)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    torch.set_num_threads(1)
-    # Mesa reads it when the first picture is asked for: workers keep all cores busy, so
-    # that drawing on further threads costs more than it gains.
-    os.environ.setdefault("LP_NUM_THREADS", "0")
-    try:
-        worker = _Worker(experiment, rows, env_kwargs)
-        pipe.send((True, worker.describe()))
-        while True:
-            name, argument = pipe.recv()
-            if name == "close":
-                return
-            pipe.send((True, getattr(worker, name)(argument)))
-    except (EOFError, BrokenPipeError):
-        return
-    except Exception:
-        pipe.send((False, traceback.format_exc()))
+    main = sys.modules["__main__"]
+    script = getattr(main, "__file__", None)
+    if script is None or getattr(main, "__spec__", None) is not None:
+        return  # a prompt or a module: there is no script that workers need
+    folder = getattr(mp.process, "ORIGINAL_DIR", None) or ""
+    if not Path(folder, script).is_file():
+        raise WorkerError(
+            f"cannot start workers: they must read the script, but {script} is no "
+            "file; save what comes from standard input as one"
+        )

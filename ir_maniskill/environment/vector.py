@@ -1,8 +1,8 @@
 """Vectorized envs: one factory for GPU-batched and CPU multi-process envs.
 
 Both give torch tensors with the same keys, shapes, dtypes and the same end of an
-episode: an env that is done is reset in the same step, and `info` holds
-`final_observation`, `final_info` and the masks `_final_observation`, `_final_info`.
+episode: an env that is done is reset in the same step, and `info` holds what
+`final_infos` says of the ended episode.
 """
 
 from __future__ import annotations
@@ -16,7 +16,12 @@ from mani_skill.envs.utils.system.backend import sim_backend_name_mapping
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 from ir_maniskill import experiment as catalog
-from ir_maniskill.environment.process_vector import ProcessVectorEnv, seeds_of
+from ir_maniskill.environment.arguments import RESET_OPTIONS, require_names, seeds_of
+from ir_maniskill.environment.process_vector import (
+    ProcessVectorEnv,
+    Step,
+    final_infos,
+)
 
 
 def make_vec(
@@ -43,7 +48,8 @@ def make_vec(
     Raises:
         UnknownExperimentError: There is no task of that id.
         ValueError: A number is out of range, or there is no such backend here.
-        WorkerError: A worker process failed to start its envs.
+        WorkerError: Worker processes cannot be started, or one failed to make its envs.
+        OSError: There is too little shared memory.
     """
     experiment = catalog.get(task_id)
     for name, number in (("num_envs", num_envs), ("num_workers", num_workers)):
@@ -102,29 +108,36 @@ class GpuVectorEnv(ManiSkillVectorEnv):
             options: As for `TouchEnv.reset`, and "env_idx": which envs to reset [b].
 
         Raises:
-            ValueError: The list has not N seeds, or a seed comes with "env_idx":
-                ManiSkill would start the other envs' random streams anew, too.
+            ValueError: An option or a seed cannot be used, or a seed comes with
+                "env_idx": ManiSkill would start the other envs' random streams anew.
         """
-        if seed is not None and "env_idx" in (options or {}):
+        options = dict(options or {})
+        require_names(options, (*RESET_OPTIONS, "env_idx"))
+        if seed is not None and "env_idx" in options:
             raise ValueError(
                 f"seed: got {seed} for some of the envs, expected None with the option "
                 "'env_idx'; leave 'env_idx' out to seed all envs"
             )
-        if seed is not None:
-            seed = seeds_of(seed, self.num_envs)
-        return super().reset(seed=seed, options=options)
+        if "env_idx" in options:
+            options["env_idx"] = torch.as_tensor(options["env_idx"], device=self.device)
+        seeds = None if seed is None else seeds_of(seed, self.num_envs)
+        return super().reset(seed=seeds, options=options)
+
+    def step(self, actions: Any) -> Step:
+        """Step all envs and reset those that are done."""
+        obs, reward, terminated, truncated, info = super().step(actions)
+        if "final_info" in info:
+            obs_then, info_then = info["final_observation"], info["final_info"]
+            info |= final_infos(obs_then, info_then, info["_final_info"])
+        return obs, reward, terminated, truncated, info
 
     def set_attr(self, name: str, values: Any) -> None:
-        """Set an attribute of the batched env, such as "dense_weights".
-
-        Raises:
-            ValueError: There is a list of values, but a batch shares one.
-        """
-        if isinstance(values, list | tuple):
-            raise ValueError(
-                f"{name}: got {len(values)} values, expected one: a batch shares it"
-            )
+        """Set an attribute of the batched env."""
         setattr(self.base_env, name, values)
+
+    def get_attr(self, name: str) -> Any:
+        """Return the attribute, which all envs of the batch share."""
+        return self._env.get_wrapper_attr(name)
 
 
 VectorEnv = GpuVectorEnv | ProcessVectorEnv

@@ -1,0 +1,157 @@
+"""What vector envs are given, checked before any env hears of it. Legend: N envs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from reprlib import repr as short
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+RESET_OPTIONS = ("instruction", "reconfigure", "reset_to_env_states")
+"""Names of the options that a reset of all envs takes."""
+
+HIGHEST_SEED = 2**32 - 1
+"""Of NumPy's random streams, from which ManiSkill draws."""
+
+
+def seeds_of(seed: int | Sequence[int], num_envs: int) -> list[int]:
+    """Return the seeds of N envs: seed + i, or those of a sequence.
+
+    Raises:
+        ValueError: There are not N of them, or some are out of range or no integers.
+    """
+    given = _plain(seed)
+    seeds = [given + row for row in range(num_envs)] if _whole(given) else given
+    valid = isinstance(seeds, list) and all(map(_whole, seeds))
+    if (
+        valid
+        and len(seeds) == num_envs
+        and 0 <= min(seeds) <= max(seeds) <= HIGHEST_SEED
+    ):
+        return seeds
+    raise ValueError(
+        f"seed: got {short(given)}, expected an integer (env i gets seed + i) or "
+        f"{num_envs} of them, so that each env's is from 0 to {HIGHEST_SEED}"
+    )
+
+
+def instruction_indices(
+    given: Any, sentences: Sequence[str], num_envs: int
+) -> list[int]:
+    """Return the index of each env's sentence.
+
+    Args:
+        given: An index or a sentence for all envs, or N of them.
+        sentences: Those that there are.
+        num_envs: Number of envs N.
+
+    Raises:
+        ValueError: It is something else, or there is no such sentence.
+    """
+    given = _plain(given)
+    each = given if isinstance(given, list) else [given] * num_envs
+    indices = [sentences.index(one) if one in sentences else one for one in each]
+    valid = len(indices) == num_envs and all(map(_whole, indices))
+    if valid and 0 <= min(indices) <= max(indices) < len(sentences):
+        return indices
+    raise ValueError(
+        f"reset option 'instruction': got {short(given)}, expected an index from 0 to "
+        f"{len(sentences) - 1} or a sentence, for all envs or a list of {num_envs}; "
+        f"sentences: {list(sentences)}"
+    )
+
+
+def options_of(
+    options: dict[str, Any], sentences: Sequence[str], num_envs: int
+) -> list[dict[str, Any]]:
+    """Return the reset options of each of N envs.
+
+    Args:
+        options: "instruction" as for `instruction_indices`; "reconfigure" is a bool for
+            all envs; "reset_to_env_states" holds trees or arrays of N rows or of one.
+        sentences: Those that there are.
+        num_envs: Number of envs N.
+
+    Raises:
+        ValueError: There is another option, or a value cannot be used.
+    """
+    require_names(options, RESET_OPTIONS)
+    dealt = {
+        name: _deal(name, value, sentences, num_envs) for name, value in options.items()
+    }
+    return [{name: dealt[name][row] for name in dealt} for row in range(num_envs)]
+
+
+def require_names(options: Iterable[str], allowed: Sequence[str]) -> None:
+    """Raise ValueError if there is an option that is not allowed."""
+    unknown = [name for name in options if name not in allowed]
+    if unknown:
+        raise ValueError(f"reset options: got {unknown}, expected some of {allowed}")
+
+
+def actions_of(actions: Any, shape: tuple[int, ...] | None) -> np.ndarray:
+    """Return actions of any kind of numbers, on any device, as float32 [N, J].
+
+    Raises:
+        ValueError: They have another shape, are not finite or no numbers.
+    """
+    try:
+        if isinstance(actions, Tensor):
+            actions = actions.detach().to("cpu", torch.float32).numpy()
+        with np.errstate(over="ignore"):  # infinity, which is refused below
+            array = np.asarray(actions, dtype=np.float32)
+    except (TypeError, ValueError, RuntimeError) as error:
+        got = f"{type(actions).__name__} ({error})"
+        raise ValueError(f"actions: got {got}, expected numbers {shape}") from None
+    if array.shape != shape:
+        raise ValueError(f"actions: got shape {array.shape}, expected {shape}")
+    if not np.isfinite(array).all():
+        raise ValueError("actions: got NaN or infinity, expected finite numbers")
+    return array
+
+
+def _deal(name: str, value: Any, sentences: Sequence[str], num_envs: int) -> list:
+    """Return the value of an option for each of N envs."""
+    what = f"reset option {name!r}"
+    if name == "instruction" and value is not None:
+        return instruction_indices(value, sentences, num_envs)
+    if name == "reconfigure" and not isinstance(_plain(value), bool):
+        raise ValueError(f"{what}: got {short(value)}, expected True or False")
+    if name != "reset_to_env_states":
+        return [value] * num_envs
+    if not isinstance(value, dict) or "env_states" not in value:
+        raise ValueError(f"{what}: got {short(value)}, expected {{'env_states': ...}}")
+    return [_row(what, value, row, num_envs) for row in range(num_envs)]
+
+
+def _row(what: str, states: Any, row: int, num_envs: int) -> Any:
+    """Return one env's row [1, ...] of nested arrays that have N rows, or one."""
+    if isinstance(states, dict):
+        return {
+            name: _row(f"{what}[{name!r}]", value, row, num_envs)
+            for name, value in states.items()
+        }
+    if isinstance(states, Tensor):
+        states = states.detach().cpu()
+    array = np.asarray(states)
+    if array.dtype.kind in "biuf" and array.ndim > 1 and len(array) in (1, num_envs):
+        return array[row % len(array)][None]
+    raise ValueError(
+        f"{what}: got {array.dtype} of shape {array.shape}, expected numbers with "
+        f"{num_envs} rows, one for each env, or a single one for all"
+    )
+
+
+def _plain(given: Any) -> Any:
+    """Return NumPy's and torch's numbers as Python's, and sequences as lists."""
+    if isinstance(given, list | tuple | range):
+        return [_plain(one) for one in given]
+    numbers = isinstance(given, Tensor | np.ndarray | np.generic)
+    return given.tolist() if numbers else given
+
+
+def _whole(given: Any) -> bool:
+    return isinstance(given, int) and not isinstance(given, bool)
