@@ -8,12 +8,12 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import killed_training
 import psutil
 import pytest
 import torch
+from mounts import disk
 from toy_envs import LENGTH, ToyVectorEnv, toy_config
 
 from ir_maniskill.environment.process_vector import WorkerError
@@ -157,22 +157,14 @@ def test_a_worker_that_dies_or_hangs_is_named_and_no_update_is_lost(
 # -- Ctrl-C ----------------------------------------------------------------------------
 
 
-def shared_memory(pid):
-    """Return the files of shared memory that a process has."""
-    lines = Path(f"/proc/{pid}/maps").read_text().splitlines()
-    return {line.split()[-1] for line in lines if "/dev/shm/" in line}
-
-
 def leave(process, blow):
     """Stop a training from outside; return its exit code and what it left running."""
     family = psutil.Process(process.pid).children(recursive=True)
-    memory = shared_memory(process.pid)
     assert len(family) >= 2
-    assert memory
     blow(process.pid)
     code = process.wait(timeout=120)
     _, alive = psutil.wait_procs(family, timeout=300)  # long only where all are busy
-    return code, [*alive, *(path for path in memory if Path(path).exists())]
+    return code, alive
 
 
 @pytest.mark.slow
@@ -234,20 +226,6 @@ def test_a_second_ctrl_c_does_not_cut_the_saving_short(
 
 
 # -- Disk ------------------------------------------------------------------------------
-
-
-@contextlib.contextmanager
-def disk(folder, options):
-    """Mount a file system in memory, where this process may."""
-    command = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)]
-    try:
-        subprocess.run(command, check=True, capture_output=True)
-    except (OSError, subprocess.CalledProcessError):
-        pytest.skip("this process may not mount file systems")
-    try:
-        yield
-    finally:
-        subprocess.run(["umount", str(folder)], check=True)
 
 
 def test_a_disk_that_fills_up_loses_no_update(tmp_path, monkeypatch, before_update):

@@ -1,37 +1,54 @@
-"""Vector envs: same numbers as single envs, ends of episodes, failures, leftovers."""
+"""Vector envs: same numbers as single envs, ends of episodes, what they are given."""
 
+import copy
 import dataclasses
-import itertools
-import os
-import signal
-import subprocess
-import sys
-import textwrap
-import time
+import pickle
 import types
 from collections.abc import Iterator
-from multiprocessing.connection import wait
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from gymnasium.wrappers.vector import (
+    NormalizeObservation,
+    NormalizeReward,
+    RecordEpisodeStatistics,
+)
+from trees import leaves
 
 import ir_maniskill
 from ir_maniskill import experiment as catalog
-from ir_maniskill.environment import process_vector, vector
-from ir_maniskill.environment.process_vector import ProcessVectorEnv, WorkerError
-from ir_maniskill.environment.reward_generator import DenseWeights
+from ir_maniskill.environment import vector
+from ir_maniskill.environment.process_vector import (
+    ProcessVectorEnv,
+    WorkerError,
+    final_infos,
+)
+from ir_maniskill.environment.shared_rows import SharedRows, record_of, reserve
 from ir_maniskill.environment.vector import make_vec
 
 TASK = "NaoTouchCubeTriangle-v1"
+SENTENCES = catalog.get(TASK).sentences
 KWARGS = {
     "obs_mode": "state_dict",
     "reward_mode": "dense",
     "render_backend": "none",
 }
+
+
+class OnGpu(torch.Tensor):
+    """Stands in for a tensor on a GPU: NumPy cannot read it, copies on the CPU can."""
+
+    def numpy(self) -> np.ndarray:
+        raise TypeError("can't convert cuda:0 device type tensor to numpy")
+
+    def to(self, *args: Any) -> torch.Tensor:
+        return self.as_subclass(torch.Tensor).to(*args)
+
+    def cpu(self) -> torch.Tensor:
+        return self.to("cpu")
 
 
 @pytest.fixture(scope="module")
@@ -64,15 +81,24 @@ def actions(steps: int, num_envs: int) -> torch.Tensor:
     return 2 * torch.rand(steps, num_envs, 26, generator=generator) - 1
 
 
+def told(envs: ProcessVectorEnv, **options: Any) -> list[int]:
+    """Reset with options and return which sentence each env has."""
+    envs.reset(options=options)
+    return [index.item() for index in envs.get_attr("instruction_index")]
+
+
+# -- The same numbers ------------------------------------------------------------------
+
+
 def test_env_i_is_a_single_env_seeded_with_seed_plus_i(envs: ProcessVectorEnv) -> None:
     many, _ = envs.reset(seed=11)
     single = gym.make(TASK, num_envs=1, **KWARGS)
     one, _ = single.reset(seed=12)
     for action in actions(6, 3):
-        for part in ("agent", "extra"):
-            for name, value in one[part].items():
-                assert torch.equal(many[part][name][1], value[0])
-                assert many[part][name].dtype == value.dtype
+        row = leaves(many)
+        for name, value in leaves(one).items():
+            assert torch.equal(row[name][1], value[0])
+            assert row[name].dtype == value.dtype
         many, rewards, *_, infos = envs.step(action)
         one, reward, *_, info = single.step(action[1])
         assert rewards[1] == reward[0]
@@ -80,15 +106,45 @@ def test_env_i_is_a_single_env_seeded_with_seed_plus_i(envs: ProcessVectorEnv) -
     single.close()
 
 
-def test_observations_are_in_the_declared_space(envs: ProcessVectorEnv) -> None:
+def test_observations_are_in_the_declared_space(
+    envs: ProcessVectorEnv, flat: ProcessVectorEnv
+) -> None:
     obs, _ = envs.reset(seed=0)
     assert obs["extra"]["object_position"].shape == (3, 3, 3)
     assert envs.observation_space.contains(arrays(obs))
+    assert flat.observation_space.contains(arrays(flat.reset(seed=0)[0]))
+
+
+def test_pictures_cross_the_process_border(multi_vec: ProcessVectorEnv) -> None:
+    multi_vec.reset(seed=0)
+    obs = multi_vec.step(np.zeros((2, 26), np.float32))[0]
+    for camera in ("top_camera", "front_camera"):
+        picture = obs["sensor_data"][camera]["rgb"]
+        assert picture.shape == (2, 64, 32, 3)
+        assert picture.dtype == torch.uint8
+        assert picture.float().std() > 10
+    assert "sensor_param" in obs
+    assert multi_vec.observation_space.contains(arrays(obs))
+
+
+def test_rows_are_copied_from_wherever_they_are() -> None:
+    depth = torch.arange(4.0).reshape(1, 2, 2)
+    row = {"depth": depth.as_subclass(OnGpu), "in": {"flag": np.ones(1, bool)}, "n": 3}
+    record = record_of({"obs": row})
+    with reserve(2 * record.itemsize) as file:
+        ours, theirs = (SharedRows(file.fileno(), record, 2) for _ in range(2))
+    theirs.write(1, {"obs": row})
+    seen = ours.read("obs")
+    theirs.write(1, {"obs": {"depth": 0 * depth}})
+    assert torch.equal(seen["depth"], torch.cat([0 * depth, depth]))
+    assert seen["in"]["flag"].tolist() == [False, True]
+    assert "n" not in seen
 
 
 def test_without_a_seed_every_env_has_a_stream_of_its_own(
     flat: ProcessVectorEnv,
 ) -> None:
+    flat._seeded = False
     first, second = flat.reset()[0], flat.reset()[0]
     starts = torch.cat([first, second])
     assert len(starts.unique(dim=0)) == 6
@@ -96,131 +152,10 @@ def test_without_a_seed_every_env_has_a_stream_of_its_own(
     assert torch.equal(flat.reset()[0], second)
 
 
-def test_flat_observations_are_one_tensor(flat: ProcessVectorEnv) -> None:
-    assert flat.observation_space.contains(flat.reset(seed=0)[0].numpy())
-    for action in actions(32, 3):
-        obs, *_, info = flat.step(action)
-    final = info["final_observation"]
-    assert final.shape == obs.shape == flat.observation_space.shape
-    assert not torch.equal(final, obs)
-
-
-def test_an_episode_ends_in_the_same_step_it_is_reset(envs: ProcessVectorEnv) -> None:
-    first, _ = envs.reset(seed=5)
-    for step, action in enumerate(actions(32, 3)):
-        obs, _, terminated, truncated, info = envs.step(action)
-        assert not terminated.any()
-        assert truncated.all() == (step == 31)
-        assert ("final_observation" in info) == (step == 31)
-    assert info["_final_info"].all()
-    assert info["_final_observation"].all()
-    assert info["final_info"]["elapsed_steps"].tolist() == [32, 32, 32]
-    assert info["elapsed_steps"].tolist() == [0, 0, 0]
-    start = first["extra"]["object_position"]
-    assert not torch.equal(obs["extra"]["object_position"], start)
-    final = info["final_observation"]["agent"]["proprioception"]
-    assert not torch.equal(final, obs["agent"]["proprioception"])
-
-
-def test_returned_tensors_are_not_overwritten_later(envs: ProcessVectorEnv) -> None:
-    obs, _ = envs.reset(seed=1)
-    before = obs["agent"]["proprioception"].clone()
-    envs.step(actions(1, 3)[0])
-    assert torch.equal(obs["agent"]["proprioception"], before)
-
-
-@pytest.mark.parametrize("form", [torch.tensor, np.array, list, tuple])
-def test_options_are_dealt_out_one_each(envs: ProcessVectorEnv, form: Any) -> None:
-    options = {"instruction": form([2, 0, 1]), "reconfigure": False}
-    obs, _ = envs.reset(seed=0, options=options)
-    assert obs["extra"]["target_object"].argmax(1).tolist() == [2, 0, 1]
-    obs, _ = envs.reset(options={"instruction": form([1, 1, 1])[0]})
-    assert obs["extra"]["target_object"].argmax(1).tolist() == [1, 1, 1]
-
-
-def test_each_env_is_reset_to_its_own_state(envs: ProcessVectorEnv) -> None:
-    env = gym.make(TASK, **KWARGS).unwrapped
-    sources = []
-    for row in range(3):
-        obs = env.reset(seed=40 + row, options={"instruction": row})[0]
-        sources.append((obs["extra"], env.get_state_dict(), env.get_state()))
-    env.close()
-    told, trees, flat = zip(*sources, strict=True)
-
-    def reset(states: Any) -> dict[str, torch.Tensor]:
-        envs.reset(seed=0)
-        options = {"reset_to_env_states": {"env_states": states}}
-        return envs.reset(options=options)[0]["extra"]
-
-    tree = {
-        kind: {key: torch.cat([t[kind][key] for t in trees]) for key in trees[0][kind]}
-        for kind in trees[0]
-    }
-    for states in (tree, arrays(tree), torch.cat(flat)):
-        obs = reset(states)
-        for row in range(3):
-            for name, value in told[row].items():
-                torch.testing.assert_close(obs[name][row], value[0])
-    for states in (trees[1], flat[1]):  # a single row is for all
-        assert reset(states)["target_object"].argmax(1).tolist() == [1, 1, 1]
-    with pytest.raises(ValueError, match=r"\['env_states'\]: got 2 values, expected 3"):
-        reset(torch.cat(flat[:2]))
-
-
 def test_seeds_may_be_those_of_numpy(flat: ProcessVectorEnv) -> None:
     expected, _ = flat.reset(seed=[4, 5, 6])
-    for seed in (4, np.int64(4), np.arange(4, 7), torch.arange(4, 7)):
+    for seed in (4, np.int64(4), np.arange(4, 7), torch.arange(4, 7), range(4, 7)):
         assert torch.equal(flat.reset(seed=seed)[0], expected)
-
-
-def test_attributes_are_set_for_all_or_one_each(envs: ProcessVectorEnv) -> None:
-    def rewards() -> list[float]:
-        envs.reset(seed=[7, 7, 7])
-        return envs.step(torch.zeros(3, 26))[1].tolist()
-
-    usual = DenseWeights()
-    none = DenseWeights(reach=0, gather=0)
-    envs.set_attr("dense_weights", [usual, none, usual])
-    one, other, third = rewards()
-    assert one == third > other == 0
-    envs.set_attr("dense_weights", usual)
-    assert rewards() == [one] * 3
-    with pytest.raises(ValueError, match="dense_weights: got 2 values, expected 3"):
-        envs.set_attr("dense_weights", [usual, usual])
-
-
-def test_wrong_shapes_are_refused(envs: ProcessVectorEnv) -> None:
-    with pytest.raises(ValueError, match=r"got shape \(2, 26\), expected \(3, 26\)"):
-        envs.step(torch.zeros(2, 26))
-    with pytest.raises(ValueError, match="actions: got NaN or infinity"):
-        envs.step(torch.full((3, 26), torch.nan))
-    with pytest.raises(ValueError, match="seeds: got 2, expected 3"):
-        envs.reset(seed=[1, 2])
-    for wrong in (2, 4):
-        with pytest.raises(ValueError, match=f"'instruction': got {wrong} values, exp"):
-            envs.reset(options={"instruction": torch.zeros(wrong, dtype=int)})
-    with pytest.raises(ValueError, match="options: got 'env_idx'"):
-        envs.reset(options={"env_idx": torch.tensor([0])})
-    with pytest.raises(ValueError, match="num_envs: got 0"):
-        make_vec(TASK, 0)
-    for wrong in (0, -1):
-        with pytest.raises(ValueError, match=f"num_workers: got {wrong}, expected at "):
-            make_vec(TASK, 2, num_workers=wrong)
-    with pytest.raises(ValueError, match="sim_backend: got 'gpus', expected 'auto' or"):
-        make_vec(TASK, 2, sim_backend="gpus")
-    with pytest.raises(catalog.UnknownExperimentError, match="available"):
-        make_vec("NoSuchTask-v1", 1)
-
-
-def test_answers_of_different_commands_cannot_get_mixed(envs: ProcessVectorEnv) -> None:
-    envs.reset(seed=0)
-    with pytest.raises(WorkerError, match="step_async. comes first"):
-        envs.step_wait()
-    envs.step_async(torch.zeros(3, 26))
-    for command in (lambda: envs.step_async(torch.zeros(3, 26)), envs.reset):
-        with pytest.raises(WorkerError, match="last command has not been answered"):
-            command()
-    assert envs.step_wait()[4]["elapsed_steps"].tolist() == [1, 1, 1]
 
 
 def test_users_own_experiments_reach_the_workers() -> None:
@@ -234,116 +169,309 @@ def test_users_own_experiments_reach_the_workers() -> None:
     envs.close()
 
 
-def test_workers_know_what_the_environment_says_now(
-    envs: ProcessVectorEnv, monkeypatch: pytest.MonkeyPatch
+# -- Ends of episodes ------------------------------------------------------------------
+
+
+def test_an_episode_ends_in_the_same_step_it_is_reset(envs: ProcessVectorEnv) -> None:
+    first, _ = envs.reset(seed=5)
+    for step, action in enumerate(actions(32, 3)):
+        obs, _, terminated, truncated, info = envs.step(action)
+        assert not terminated.any()
+        assert truncated.all() == (step == 31)
+        assert ("final_observation" in info) == (step == 31)
+    assert info["final_obs"] is info["final_observation"]
+    for name in ("final_obs", "final_observation", "final_info"):
+        assert info[f"_{name}"].tolist() == [True, True, True]
+    assert info["final_info"]["elapsed_steps"].tolist() == [32, 32, 32]
+    assert info["elapsed_steps"].tolist() == [0, 0, 0]
+    start = first["extra"]["object_position"]
+    assert not torch.equal(obs["extra"]["object_position"], start)
+    final = info["final_obs"]["agent"]["proprioception"]
+    assert not torch.equal(final, obs["agent"]["proprioception"])
+
+
+@pytest.mark.parametrize(
+    ("done", "expected"),
+    [([True, False, True], [5, 0, 7]), ([False, True, False], [0, 6, 0])],
+)
+def test_final_rows_of_envs_that_go_on_are_zero(done: list, expected: list) -> None:
+    info = {"steps": torch.tensor([5, 6, 7]), "deep": {"once": torch.ones(3, 2).bool()}}
+    final = final_infos(torch.ones(3, 4), info, torch.tensor(done))
+    assert final["final_info"]["steps"].tolist() == expected
+    assert final["final_info"]["deep"]["once"][:, 1].tolist() == done
+    assert final["final_obs"].sum(1).tolist() == [4.0 * end for end in done]
+    assert final["_final_info"].tolist() == done
+
+
+def test_returned_tensors_are_not_overwritten_later(envs: ProcessVectorEnv) -> None:
+    obs, _ = envs.reset(seed=1)
+    before = obs["agent"]["proprioception"].clone()
+    envs.step(actions(1, 3)[0])
+    assert torch.equal(obs["agent"]["proprioception"], before)
+
+
+# -- What they are given ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", [torch.tensor, np.array, list, tuple])
+def test_instructions_are_dealt_out_one_each(envs: ProcessVectorEnv, form: Any) -> None:
+    assert told(envs, instruction=form([2, 0, 1]), reconfigure=False) == [2, 0, 1]
+    assert told(envs, instruction=form([1, 1, 1])[0]) == [1, 1, 1]
+
+
+def test_instructions_may_be_sentences(envs: ProcessVectorEnv) -> None:
+    red, blue = SENTENCES[0], SENTENCES[2]
+    assert told(envs, instruction=blue) == [2, 2, 2]
+    assert told(envs, instruction=[blue, red, blue]) == [2, 0, 2]
+    assert told(envs, instruction=np.array([red, red, blue])) == [0, 0, 2]
+    assert told(envs, instruction=(1, red, 2)) == [1, 0, 2]
+
+
+WRONG_RESETS = [
+    ({"seed": -1}, "seed: got -1, expected an integer"),
+    ({"seed": 2**32}, "seed: got 4294967296, expected"),
+    ({"seed": 2**32 - 2}, "so that each env's is from 0 to 4294967295"),
+    ({"seed": [1, 2]}, r"seed: got \[1, 2\], expected .* 3 of them"),
+    ({"seed": [1, 2, -3]}, r"seed: got \[1, 2, -3\]"),
+    ({"seed": np.array([0.5, 1, 2])}, r"seed: got \[0.5, 1.0, 2.0\]"),
+    ({"seed": True}, "seed: got True"),
+    ({"options": {"instructon": 0}}, r"got \['instructon'\], expected some of .*recon"),
+    ({"options": {"env_idx": [0]}}, "got 'env_idx', expected none"),
+    ({"options": {"instruction": 3}}, "'instruction': got 3, expected an index from 0"),
+    ({"options": {"instruction": True}}, "'instruction': got True"),
+    ({"options": {"instruction": 1.5}}, "'instruction': got 1.5"),
+    ({"options": {"instruction": [0, 1]}}, r"got \[0, 1\], .* or a list of 3"),
+    ({"options": {"instruction": torch.zeros(4).long()}}, r"got \[0, 0, 0, 0\]"),
+    ({"options": {"instruction": "Touch."}}, "got 'Touch.'.*; sentences: .*red cube"),
+    ({"options": {"instruction": ["a", "b", "c"]}}, r"got \['a', 'b', 'c'\]"),
+    ({"options": {"reconfigure": 1}}, "'reconfigure': got 1, expected True or False"),
+    ({"options": {"reset_to_env_states": torch.zeros(3, 9)}}, "expected {'env_states'"),
+    (
+        {"options": {"reset_to_env_states": {"env_states": torch.zeros(2, 9)}}},
+        r"\['env_states'\]: got float32 of shape \(2, 9\), expected .* 3 rows",
+    ),
+    (
+        {"options": {"reset_to_env_states": {"env_states": {"task": "none"}}}},
+        r"\['env_states'\]\['task'\]: got <U4 of shape \(\)",
+    ),
+]
+
+
+@pytest.mark.parametrize(("wrong", "message"), WRONG_RESETS)
+def test_wrong_resets_are_refused_and_change_nothing(
+    envs: ProcessVectorEnv, wrong: dict, message: str
 ) -> None:
-    monkeypatch.setenv("IR_MANISKILL_NAO_URDF", "/no/such.urdf")
-    with pytest.raises(WorkerError, match=r"/no/such\.urdf: no such file"):
-        make_vec(TASK, 1, sim_backend="physx_cpu", **KWARGS)
-
-
-def test_a_failing_worker_says_why() -> None:
-    with pytest.raises(WorkerError, match=r"worker-0 \(envs 0 to 0\)(.|\n)*smell"):
-        make_vec(TASK, 1, sim_backend="physx_cpu", **KWARGS | {"reward_mode": "smell"})
-
-
-def test_a_dead_worker_is_named_and_close_leaves_nothing() -> None:
-    envs = make_vec(TASK, 2, num_workers=2, sim_backend="physx_cpu", **KWARGS)
-    envs.reset(seed=0)
-    victims = [process.pid for process in envs._processes]
-    os.kill(victims[1], signal.SIGKILL)
-    with pytest.raises(WorkerError, match=r"worker-1 \(envs 1 to 1\) died.*code -9"):
-        envs.step(torch.zeros(2, 26))
-    envs.close()
-    assert not any(alive(pid) for pid in victims)
-    with pytest.raises(WorkerError, match="closed"):
-        envs.reset()
-
-
-def test_a_script_without_a_guard_is_told_to_have_one(tmp_path: Path) -> None:
-    script = tmp_path / "unguarded.py"
-    options = "sim_backend='physx_cpu', obs_mode='state', render_backend='none'"
-    script.write_text(f"import ir_maniskill as ir\nir.make_vec({TASK!r}, 1, {options})")
-    done = subprocess.run([sys.executable, script], capture_output=True, text=True)
-    assert done.returncode == 1
-    last = done.stderr.splitlines()[-1]
-    assert "code 1;" in last and "guard the script's entry with `if __name__" in last
-
-
-def test_a_hanging_worker_is_named_instead_of_waited_for() -> None:
-    envs = make_vec(TASK, 1, sim_backend="physx_cpu", timeout=600, **KWARGS)
-    envs.reset(seed=0)
-    assert envs._timeout == 600
-    envs._timeout = 0.5
-    os.kill(envs._processes[0].pid, signal.SIGSTOP)
-    with pytest.raises(WorkerError, match="no answer within 0.5 s from .*worker-0"):
-        envs.step(torch.zeros(1, 26))
-    pid = envs._processes[0].pid
-    os.kill(pid, signal.SIGCONT)
-    with pytest.raises(WorkerError, match="not been answered"):  # not the late answer
-        envs.reset()
-    os.kill(pid, signal.SIGSTOP)
-    envs.close()
-    assert not alive(pid)
-
-
-def test_an_hour_in_which_all_were_stopped_is_no_waiting(
-    envs: ProcessVectorEnv, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    envs.reset(seed=0)
-    clock, looks = itertools.count(0, 3600), []
-
-    def look(pipes: list, left: float) -> list:
-        looks.append(left)
-        return wait(pipes, 60) if len(looks) > 1 else []
-
-    ticking = types.SimpleNamespace(monotonic=lambda: next(clock))
-    monkeypatch.setattr(process_vector, "time", ticking)
-    monkeypatch.setattr(process_vector, "wait", look)
+    envs.reset(options={"instruction": [2, 0, 1]})
+    with pytest.raises(ValueError, match=message):
+        envs.reset(**wrong)
     assert envs.step(torch.zeros(3, 26))[4]["elapsed_steps"].tolist() == [1, 1, 1]
-    assert len(looks) > 1
+    assert [i.item() for i in envs.get_attr("instruction_index")] == [2, 0, 1]
 
 
-def alive(pid: int) -> bool:
-    """Return whether a process of that id runs (a zombie does not)."""
-    try:
-        with open(f"/proc/{pid}/stat") as file:
-            return file.read().split(") ")[1][0] != "Z"
-    except FileNotFoundError:
-        return False
+def test_what_only_an_env_can_refuse_leaves_the_others_usable(
+    envs: ProcessVectorEnv,
+) -> None:
+    nobody = {"actors": {"nobody": torch.zeros(3, 13)}}
+    for states in (nobody, torch.zeros(3, 5)):
+        with pytest.raises(WorkerError, match=r"worker-0 \(envs 0 to 1\) failed"):
+            envs.reset(options={"reset_to_env_states": {"env_states": states}})
+        envs.reset(seed=1)
+        assert envs.step(torch.zeros(3, 26))[4]["elapsed_steps"].tolist() == [1, 1, 1]
 
 
-@pytest.mark.slow
-def test_workers_end_when_the_parent_is_killed() -> None:
-    script = """
-        import time
-        from ir_maniskill import make_vec
-        if __name__ == "__main__":
-            envs = make_vec("NaoTouchCubeSingle-v1", 2, num_workers=2,
-                            sim_backend="physx_cpu", obs_mode="state_dict",
-                            render_backend="none")
-            print(*(p.pid for p in envs._processes), flush=True)
-            time.sleep(60)
-    """
-    parent = subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(script)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    )
-    workers = [int(pid) for pid in parent.stdout.readline().split()]
-    assert len(workers) == 2
-    parent.kill()
-    parent.wait()
-    deadline = time.monotonic() + 20
-    while any(map(alive, workers)) and time.monotonic() < deadline:
-        time.sleep(0.2)
-    assert not any(map(alive, workers))
+def test_each_env_is_reset_to_its_own_state(envs: ProcessVectorEnv) -> None:
+    env = gym.make(TASK, **KWARGS).unwrapped
+    sources = []
+    for row in range(3):
+        obs = env.reset(seed=40 + row, options={"instruction": row})[0]
+        sources.append((obs["extra"], env.get_state_dict(), env.get_state()))
+    env.close()
+    seen, trees, rows = zip(*sources, strict=True)
+
+    def reset(states: Any) -> dict[str, torch.Tensor]:
+        envs.reset(seed=0)
+        options = {"reset_to_env_states": {"env_states": states}}
+        return envs.reset(options=options)[0]["extra"]
+
+    tree = {
+        kind: {key: torch.cat([t[kind][key] for t in trees]) for key in trees[0][kind]}
+        for kind in trees[0]
+    }
+    for states in (tree, arrays(tree), torch.cat(rows)):
+        obs = reset(states)
+        for row in range(3):
+            for name, value in seen[row].items():
+                torch.testing.assert_close(obs[name][row], value[0])
+    for states in (trees[1], rows[1]):  # a single row is for all
+        assert reset(states)["target_object"].argmax(1).tolist() == [1, 1, 1]
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        lambda a: a.clone().requires_grad_(),
+        lambda a: a.to(torch.bfloat16),
+        lambda a: a.as_subclass(OnGpu),
+        lambda a: a.double().numpy()[::-1].copy()[::-1],  # negative strides
+        lambda a: a.tolist(),
+    ],
+)
+def test_actions_of_all_kinds_are_taken(envs: ProcessVectorEnv, kind: Any) -> None:
+    plain = (8 * actions(1, 3)[0]).round() / 8  # which bfloat16 can hold
+    after = []
+    for given in (plain, kind(plain)):
+        envs.reset(seed=2)
+        after.append(envs.step(given)[0]["agent"]["target"])
+    assert torch.equal(*after)
+    assert not after[1].requires_grad
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (torch.zeros(2, 26), r"got shape \(2, 26\), expected \(3, 26\)"),
+        (np.zeros(26), r"got shape \(26,\), expected \(3, 26\)"),
+        (torch.full((3, 26), torch.nan), "got NaN or infinity"),
+        (np.full((3, 26), -np.inf), "got NaN or infinity"),
+        (np.full((3, 26), 1e300), "got NaN or infinity"),
+        ([["left"] * 26] * 3, "got list .*expected numbers"),
+        (None, "actions: got"),
+    ],
+)
+def test_wrong_actions_are_refused_and_no_env_steps(
+    envs: ProcessVectorEnv, wrong: Any, message: str
+) -> None:
+    envs.reset(seed=0)
+    with pytest.raises(ValueError, match=message):
+        envs.step(wrong)
+    assert envs.step(torch.zeros(3, 26))[4]["elapsed_steps"].tolist() == [1, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"num_envs": 0}, "num_envs: got 0"),
+        ({"num_workers": 0}, "num_workers: got 0, expected at least 1"),
+        ({"num_workers": -1}, "num_workers: got -1, expected at least 1"),
+        ({"sim_backend": "gpus"}, "sim_backend: got 'gpus', expected 'auto' or one of"),
+        ({"task_id": "NoSuchTask-v1"}, "available"),
+    ],
+)
+def test_envs_that_cannot_be_are_not_made(kwargs: dict, message: str) -> None:
+    with pytest.raises(Exception, match=message) as caught:
+        make_vec(**{"task_id": TASK, "num_envs": 2} | kwargs)
+    assert isinstance(caught.value, ValueError | catalog.UnknownExperimentError)
+
+
+def test_answers_of_different_commands_cannot_get_mixed(envs: ProcessVectorEnv) -> None:
+    envs.reset(seed=0)
+    with pytest.raises(WorkerError, match="step_async. comes first"):
+        envs.step_wait()
+    envs.step_async(torch.zeros(3, 26))
+    for command in (lambda: envs.step_async(torch.zeros(3, 26)), envs.reset):
+        with pytest.raises(WorkerError, match="last command has not been answered"):
+            command()
+    assert envs.step_wait()[4]["elapsed_steps"].tolist() == [1, 1, 1]
+
+
+# -- What Gymnasium's have -------------------------------------------------------------
+
+
+def test_methods_are_called_and_attributes_read_in_every_env(
+    envs: ProcessVectorEnv,
+) -> None:
+    envs.reset(options={"instruction": [0, 1, 2]})
+    said = envs.call("get_language_instruction")
+    assert said == tuple([sentence] for sentence in SENTENCES)
+    assert envs.get_attr("render_mode") == (None, None, None)
+    qpos = envs.call("get_state_dict")[2]["controller"]["target_qpos"]
+    assert qpos.shape == (1, 26)
+    assert envs.call("get_obs", info=None)[0]["extra"]["touch"].shape == (1, 6)
+    with pytest.raises(ValueError, match="call: got 'reset'"):
+        envs.call("reset", seed=1)
+    for name, reason in (("smell", "no attribute 'smell'"), ("scene", "cannot pickle")):
+        with pytest.raises(WorkerError, match=f"(?s)worker-0.*{reason}"):
+            envs.get_attr(name)
+    assert envs.step(torch.zeros(3, 26))[4]["elapsed_steps"].tolist() == [1, 1, 1]
+
+
+def test_gymnasiums_wrappers_record_and_scale_rewards(envs: ProcessVectorEnv) -> None:
+    wrapped = NormalizeReward(RecordEpisodeStatistics(envs))
+    for _ in range(2):
+        wrapped.reset(seed=3)
+        rewards, scaled = [], []
+        for action in actions(32, 3):
+            scaled.append(wrapped.step(action)[1])
+        info = wrapped.step(actions(1, 3)[0])[4]
+    assert "episode" not in info  # of the step after the end
+    envs.reset(seed=3)
+    rewards = torch.stack([envs.step(action)[1] for action in actions(32, 3)])
+    returns = rewards.sum(0).tolist()
+    assert np.allclose(wrapped.env.return_queue, [*returns, *returns])
+    assert list(wrapped.env.length_queue) == [32] * 6
+    ratio = torch.stack(scaled) / rewards
+    assert ratio.std(dim=1).nan_to_num().max() < 1e-4  # one scale for all in a step
+    assert not torch.allclose(ratio, torch.ones(()))
+    with pytest.raises(ValueError, match="NEXT_STEP"):
+        NormalizeObservation(envs)
+
+
+def test_rewards_are_arrays_to_numpy_and_plain_tensors_to_torch(
+    envs: ProcessVectorEnv,
+) -> None:
+    envs.reset(seed=0)
+    _, reward, terminated, truncated, _ = envs.step(torch.zeros(3, 26))
+    either = np.logical_or(terminated, truncated)
+    for array in (either, np.where(either, 0, reward), np.zeros(3) + reward):
+        assert type(array) is np.ndarray
+    assert np.sum(either) == 0
+    assert (1 - terminated).tolist() == [1, 1, 1]
+    assert torch.equal(1 - reward, -(reward - 1))
+    for plain in (
+        terminated | truncated,
+        reward + 1,
+        torch.stack([reward, reward]),
+        copy.deepcopy(reward),
+        pickle.loads(pickle.dumps(reward)),
+    ):
+        assert type(plain) is torch.Tensor
+
+
+# -- Batches on a GPU ------------------------------------------------------------------
 
 
 @pytest.fixture
 def cuda(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+
+
+class Batch(types.SimpleNamespace):
+    """Stands in for ManiSkill's batched env, which needs a GPU: env 1 of 3 ends."""
+
+    get_wrapper_attr = types.SimpleNamespace.__getattribute__
+
+    def __init__(self) -> None:
+        base = types.SimpleNamespace(num_envs=3, experiment=None, device="cpu")
+        spaces = ("observation_space", "action_space")
+        made = dict.fromkeys([*spaces, *(f"single_{name}" for name in spaces)])
+        super().__init__(unwrapped=base, spec=None, metadata={}, resets=[], **made)
+
+    def reset(self, seed: list[int] | None, options: dict) -> tuple[dict, dict]:
+        chosen = options.get("env_idx")
+        self.resets.append((seed, None if chosen is None else chosen.tolist()))
+        return {}, {}
+
+    def step(self, action: Any) -> tuple:
+        done = torch.tensor([False, True, False])
+        info = {"elapsed_steps": torch.tensor([3, 32, 5])}
+        return {"touch": torch.ones(3, 2)}, torch.zeros(3), ~done & done, done, info
+
+
+@pytest.fixture
+def batch(cuda: None, monkeypatch: pytest.MonkeyPatch) -> Batch:
+    batch = Batch()
+    monkeypatch.setattr(vector.gym, "make", lambda *_, **__: batch)
+    return batch
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
@@ -362,47 +490,24 @@ def test_every_name_of_the_gpu_means_the_gpu(
     assert make_vec(TASK, 3, sim_backend=backend) == backend
 
 
-@pytest.mark.usefixtures("cuda")
-def test_a_batch_on_a_gpu_is_seeded_alike(monkeypatch: pytest.MonkeyPatch) -> None:
-    resets: list[tuple] = []
-
-    def reset(seed: list[int] | None, options: dict | None) -> tuple[dict, dict]:
-        resets.append((seed, options))
-        return {}, {}
-
-    class Batch(types.SimpleNamespace):
-        """Stands in for ManiSkill's env: it needs a GPU."""
-
-        get_wrapper_attr = types.SimpleNamespace.__getattribute__
-
-    base = types.SimpleNamespace(num_envs=3, experiment=None, device="cpu")
-    spaces = ("observation_space", "action_space")
-    made = dict.fromkeys([*spaces, *(f"single_{name}" for name in spaces)])
-    batch = Batch(unwrapped=base, spec=None, metadata={}, reset=reset, **made)
-    monkeypatch.setattr(vector.gym, "make", lambda *_, **__: batch)
+def test_a_batch_on_a_gpu_is_seeded_alike(batch: Batch) -> None:
     envs = make_vec(TASK, 3, sim_backend="physx_cuda")
-    some = {"env_idx": torch.tensor([1])}
     envs.reset(seed=np.int64(7))
     envs.reset(seed=[5, 3, 4])
-    envs.reset(options=some)
-    assert resets == [([7, 8, 9], None), ([5, 3, 4], None), (None, some)]
+    for some in ([2, 0], torch.tensor([2, 0])):
+        envs.reset(options={"env_idx": some})
+    assert batch.resets == [([7, 8, 9], None), ([5, 3, 4], None)] + [(None, [2, 0])] * 2
     with pytest.raises(ValueError, match="seed: got 7 for some of the envs"):
-        envs.reset(seed=7, options=some)
-    with pytest.raises(ValueError, match="seeds: got 2, expected 3"):
+        envs.reset(seed=7, options={"env_idx": [1]})
+    with pytest.raises(ValueError, match=r"seed: got \[1, 2\], expected"):
         envs.reset(seed=[1, 2])
-    envs.set_attr("dense_weights", "new")
-    assert base.dense_weights == "new"
-    with pytest.raises(ValueError, match="dense_weights: got 3 values, expected one"):
-        envs.set_attr("dense_weights", ["new"] * 3)
+    with pytest.raises(ValueError, match=r"got \['env_id'\], expected some of"):
+        envs.reset(options={"env_id": [1]})
 
 
-def test_pictures_cross_the_process_border(multi_vec: ProcessVectorEnv) -> None:
-    obs, _ = multi_vec.reset(seed=0)
-    obs = multi_vec.step(np.zeros((2, 26), np.float32))[0]
-    for camera in ("top_camera", "front_camera"):
-        picture = obs["sensor_data"][camera]["rgb"]
-        assert picture.shape == (2, 64, 32, 3)
-        assert picture.dtype == torch.uint8
-        assert picture.float().std() > 10
-    assert "sensor_param" in obs
-    assert multi_vec.observation_space.contains(arrays(obs))
+def test_a_batch_on_a_gpu_ends_episodes_alike(batch: Batch) -> None:
+    info = make_vec(TASK, 3, sim_backend="physx_cuda").step(None)[4]
+    assert info["final_info"]["elapsed_steps"].tolist() == [0, 32, 0]
+    assert info["final_obs"]["touch"].sum(1).tolist() == [0, 2, 0]
+    assert info["_final_obs"].tolist() == [False, True, False]
+    assert batch.resets == [(None, [1])]
