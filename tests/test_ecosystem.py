@@ -139,6 +139,22 @@ def test_a_row_of_a_recording_restores_the_whole_state(recorded: Path) -> None:
     env.close()
 
 
+@pytest.mark.render
+def test_maniskill_writes_our_info_into_its_videos(tmp_path: Path) -> None:
+    camera = {"width": 64, "height": 64, "shader_pack": "trivial"}
+    env: Any = gym.make(
+        "NaoTouchCubeMulti-v1",
+        obs_mode="none",
+        render_mode="rgb_array",
+        human_render_camera_configs=camera,
+    )
+    env = RecordEpisode(env, str(tmp_path), save_trajectory=False, info_on_video=True)
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    env.close()
+    assert (tmp_path / "0.mp4").stat().st_size > 1000
+
+
 # -- ManiSkill's PPO layout ------------------------------------------------------------
 
 
