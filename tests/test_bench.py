@@ -37,7 +37,7 @@ class FakeEnv:
         self.calls = []
 
     def reset(self):
-        time.sleep(0.05)
+        time.sleep(0.2)
         self.calls.append("reset")
 
     def step(self, action):
@@ -49,7 +49,7 @@ def test_resets_are_not_timed(monkeypatch):
     monkeypatch.setattr(bench, "actions", lambda _, steps: list(range(steps)))
     env.spec = type("Spec", (), {"max_episode_steps": 5})
     block = bench.Stepping(env, 2)
-    assert max(block(), block(), block()) < 0.02
+    assert max(block(), block(), block()) < 0.05
     assert env.calls == ["reset", 0, 1, 2, 3, "reset", 0, 1]
 
 
