@@ -18,13 +18,13 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from ir_maniskill import experiment as catalog
-from ir_maniskill.environment.instructional_set import InstructionalSet
 from ir_maniskill.environment.state import State
 from ir_maniskill.environment.vector import make_vec
 from ir_maniskill.evaluation.evaluate import EVALUATION_SEED, evaluate_policy
-from ir_maniskill.experiment import Experiment
+from ir_maniskill.experiment import Experiment, tokenize
 from ir_maniskill.training.checkpoint import load_policy
 
 ROOT = Path(__file__).parent.parent
@@ -62,6 +62,13 @@ def retold(tokens: Tensor, instead: list[int]) -> Change:
     return change
 
 
+def tokens_of(experiment: Experiment) -> Tensor:
+    """Return all sentences of a task as the env gives them [I, L]."""
+    words = experiment.vocabulary
+    rows = [torch.tensor(tokenize(s, words)) for s in experiment.sentences]
+    return pad_sequence(rows, batch_first=True)
+
+
 def controls(experiment: Experiment) -> dict[str, Change]:
     """Return the controls by name; those of the sentence need several sentences."""
     changes = {
@@ -72,7 +79,7 @@ def controls(experiment: Experiment) -> dict[str, Change]:
     }
     count = len(experiment.sentences)
     if count > 1:
-        tokens = InstructionalSet(experiment, torch.device("cpu")).tokens
+        tokens = tokens_of(experiment)
         shifted = [(index + 1) % count for index in range(count)]
         changes["the sentence of another object"] = retold(tokens, shifted)
         changes["always the first sentence"] = retold(tokens, [0] * count)
