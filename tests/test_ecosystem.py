@@ -20,7 +20,7 @@ from mani_skill.utils.wrappers import (
 )
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
-from ir_maniskill import Experiment, Instruction, TouchObject, register
+from ir_maniskill import Experiment, Instruction, Ref, Touch, TouchObject, register
 from ir_maniskill.experiment import VOCABULARY
 
 STEPS = 16
@@ -40,8 +40,8 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     lemon = TouchObject("yellow", (0.21, 0.06))
     plum = TouchObject("purple", (0.21, -0.06))
     sentences = (
-        Instruction("Touch the lemon.", target=lemon.name),
-        Instruction("Touch the plum, not the lemon.", target=plum.name),
+        Instruction("Touch the lemon.", Touch(Ref("yellow"))),
+        Instruction("Touch the plum, not the lemon.", Touch(Ref("purple"))),
     )
     words = (*VOCABULARY, "plum", "lemon", "not")
     register(Experiment("RecordFruit-v1", (lemon, plum), sentences, vocabulary=words))
