@@ -7,13 +7,14 @@ TORCH_INDEX ?=
 DEMO_TASK   ?= NaoTouchCubeSingle-v1
 DEMO_DIR    ?= runs/demo
 EPISODES    ?= 100
+JOBS        ?= 2
 
 BIN         := $(VENV)/bin
 IR          := $(BIN)/ir-maniskill
 PACKAGES    := $(VENV)/.stamp-packages
 VULKAN      := $(VENV)/.stamp-vulkan
 SOURCES     := ir_maniskill tasks assets tests examples scripts
-PYTEST      := $(BIN)/python -m pytest
+PYTEST      := $(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 
 export TORCH_INDEX
 # Threads that wait for work must not take the cores from the simulator.

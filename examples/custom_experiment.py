@@ -8,15 +8,15 @@ from typing import Any
 import gymnasium as gym
 import tyro
 
-from ir_maniskill import Experiment, Instruction, TouchObject, register
+from ir_maniskill import Experiment, Instruction, Ref, Touch, TouchObject, register
 from ir_maniskill.experiment import VOCABULARY
 from ir_maniskill.training.config import TrainConfig
 from ir_maniskill.training.train import train
 
 LEMON = TouchObject("yellow", (0.21, 0.06))  # x forward, y left of the torso [m]
 PLUM = TouchObject("purple", (0.21, -0.06), shape="button")
-SWEET = Instruction("Touch the plum, not the lemon.", target=PLUM.name)
-SOUR = Instruction("Touch the lemon.", target=LEMON.name)
+SWEET = Instruction("Touch the plum, not the lemon.", Touch(Ref("purple")))
+SOUR = Instruction("Touch the lemon.", Touch(Ref("yellow")))
 WORDS = (*VOCABULARY, "plum", "lemon", "not")
 FRUIT = Experiment(
     "TouchFruit-v1", (LEMON, PLUM), (SWEET, SOUR), wrong_penalty=0.1, vocabulary=WORDS

@@ -323,7 +323,7 @@ def _curve(command: Curve) -> int:
 def _bench(command: Bench) -> int:
     if not 0 < command.seconds <= 600:
         raise UsageError(f"--seconds: got {command.seconds:g}, expected up to 600")
-    from ir_maniskill.bench import run as bench  # it loads much that others don't need
+    from ir_maniskill import bench  # it loads much that others don't need
 
     if command.json is not None:
         _require_writable(command.json)

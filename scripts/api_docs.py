@@ -13,11 +13,9 @@ import ir_maniskill
 
 
 def specs() -> list[str]:
-    """Return what pdoc is to document; it finds what is below these by itself."""
+    """Return what pdoc is to document: by itself it would stop at `__all__`."""
     children = pkgutil.iter_modules(ir_maniskill.__path__, "ir_maniskill.")
-    # tasks/ and assets/ are mapped into the package: they are not found by walking it.
-    mapped = {"ir_maniskill", "ir_maniskill.assets", "ir_maniskill.tasks"}
-    return sorted(mapped | {child.name for child in children})
+    return ["ir_maniskill", *(child.name for child in children)]
 
 
 def write(out: Path) -> None:

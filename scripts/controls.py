@@ -3,8 +3,8 @@
 A policy that looks must fail with black pictures, and one that reads with a sentence
 that is not the one the episode is judged by. Every control plays the same scenes.
 
-    python scripts/controls.py
-    python scripts/controls.py runs/NaoTouchCubeShuffled-v1/best.safetensors
+    python scripts/controls.py                 # all shipped policies
+    python scripts/controls.py runs/NAME/best.safetensors
 """
 
 from __future__ import annotations
@@ -12,23 +12,19 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from ir_maniskill import experiment as catalog
-from ir_maniskill.environment.instructional_set import InstructionalSet
 from ir_maniskill.environment.state import State
 from ir_maniskill.environment.vector import make_vec
-from ir_maniskill.evaluation.evaluate import (
-    EVALUATION_SEED,
-    Policy,
-    evaluate_policy,
-    versions,
-)
-from ir_maniskill.experiment import Experiment
+from ir_maniskill.evaluation.evaluate import EVALUATION_SEED, evaluate_policy
+from ir_maniskill.experiment import Experiment, tokenize
 from ir_maniskill.training.checkpoint import load_policy
 
 ROOT = Path(__file__).parent.parent
@@ -40,11 +36,7 @@ Change = Callable[[State], State]
 
 
 def without(*keys: str) -> Change:
-    """Return the control that replaces parts of the state by zeros.
-
-    Args:
-        *keys: Entries of the state; those it does not have are passed over.
-    """
+    """Return the control that replaces these parts of the state, if there, by zeros."""
 
     def change(state: State) -> State:
         blank = {key: torch.zeros_like(state[key]) for key in keys if key in state}
@@ -70,6 +62,13 @@ def retold(tokens: Tensor, instead: list[int]) -> Change:
     return change
 
 
+def tokens_of(experiment: Experiment) -> Tensor:
+    """Return all sentences of a task as the env gives them [I, L]."""
+    words = experiment.vocabulary
+    rows = [torch.tensor(tokenize(s, words)) for s in experiment.sentences]
+    return pad_sequence(rows, batch_first=True)
+
+
 def controls(experiment: Experiment) -> dict[str, Change]:
     """Return the controls by name; those of the sentence need several sentences."""
     changes = {
@@ -80,65 +79,45 @@ def controls(experiment: Experiment) -> dict[str, Change]:
     }
     count = len(experiment.sentences)
     if count > 1:
-        tokens = InstructionalSet(experiment, torch.device("cpu")).tokens
+        tokens = tokens_of(experiment)
         shifted = [(index + 1) % count for index in range(count)]
         changes["the sentence of another object"] = retold(tokens, shifted)
         changes["always the first sentence"] = retold(tokens, [0] * count)
     return changes
 
 
-def measure(path: Path, episodes: int, num_envs: int) -> tuple[str, dict[str, Any]]:
+def measure(path: Path, episodes: int) -> tuple[str, dict[str, Any]]:
     """Return a policy's task, and its figures under each control.
 
     Args:
         path: Policy or checkpoint file.
         episodes: Episodes of each control, spread evenly over the sentences.
-        num_envs: Scenes simulated side by side.
     """
     agent, config, facts = load_policy(path)
-    changes = controls(catalog.get(config.env_id))
-    envs = make_vec(config.env_id, num_envs, **config.env_kwargs(training=False))
+    play: dict[str, Any] = {"seed": EVALUATION_SEED, "frames": config.frames}
     figures = {}
-    try:
-        for name, change in changes.items():
+    with closing(
+        make_vec(config.env_id, 8, **config.env_kwargs(training=False))
+    ) as envs:
+        for name, change in controls(catalog.get(config.env_id)).items():
             report = evaluate_policy(
-                _changed(agent.policy, change),
+                lambda state, change=change: agent.policy(change(state)),
                 config.env_id,
                 episodes=episodes,
-                seed=EVALUATION_SEED,
-                frames=config.frames,
                 envs=envs,
                 progress=True,
+                **play,
             )
             figures[name] = report.overall.as_dict()
-    finally:
-        envs.close()
-    about = {"steps": facts.get("steps"), "training_seed": config.seed}
-    about["seed"] = EVALUATION_SEED
-    return config.env_id, {**about, "versions": versions(), "controls": figures}
-
-
-def _changed(policy: Policy, change: Change) -> Policy:
-    return lambda state: policy(change(state))
-
-
-def main() -> None:
-    """Measure the policies given and write them into the file, beside others there."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
-    parser.add_argument(
-        "policies", nargs="*", type=Path, help="files; default: all that ship"
-    )
-    parser.add_argument("--episodes", type=int, default=120, help="of each control")
-    parser.add_argument("--num-envs", type=int, default=8)
-    parser.add_argument("--out", type=Path, default=OUT)
-    given = parser.parse_args()
-    data = json.loads(given.out.read_text()) if given.out.exists() else {}
-    for path in given.policies or sorted(SHIPPED.glob("*.safetensors")):
-        task, figures = measure(path, given.episodes, given.num_envs)
-        data[task] = figures
-        given.out.parent.mkdir(parents=True, exist_ok=True)
-        given.out.write_text(json.dumps(data, indent=1) + "\n")
+    return config.env_id, {"steps": facts.get("steps"), "controls": figures}
 
 
 if __name__ == "__main__":
-    main()
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser.add_argument("policies", nargs="*", type=Path, help="default: all shipped")
+    parser.add_argument("--episodes", type=int, default=120, help="of each control")
+    given = parser.parse_args()
+    data = json.loads(OUT.read_text())
+    for path in given.policies or sorted(SHIPPED.glob("*.safetensors")):
+        task, data[task] = measure(path, given.episodes)
+        OUT.write_text(json.dumps(data, indent=1) + "\n")

@@ -1,8 +1,7 @@
 """Ships the best policy of a run with the package: `ship_policy.py runs/NAME`.
 
-Rounds the weights to few bits, evaluates the rounded policy on pinned scenes, tells it
-all sentences of the task in the same ones, and writes it with its config, figures and
-the commit to `assets/policies/ID.safetensors`.
+Stores the weights with 16 bits, evaluates the policy as stored, and writes it to
+`assets/policies/ID.safetensors`, with its figures beside it and inside.
 """
 
 from __future__ import annotations
@@ -15,15 +14,10 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-import torch
-from torch import Tensor
-
 from ir_maniskill import experiment as catalog
-from ir_maniskill.environment.state import State
 from ir_maniskill.evaluation.evaluate import (
     EVALUATION_SEED,
     EvaluationReport,
-    Policy,
     evaluate_policy,
     evaluate_scenes,
 )
@@ -31,84 +25,61 @@ from ir_maniskill.training import checkpoint
 
 FOLDER = Path(__file__).parent.parent / "assets" / "policies"
 
-SEEN_EPISODES = 120
-"""Episodes whose states the rounded policy shall act alike in."""
-
 
 def ship(run: Path, episodes: int, scenes: int) -> EvaluationReport:
     """Round, evaluate and write the best policy of a run.
 
     Args:
         run: Folder of the run.
-        episodes: Episodes for each instruction.
-        scenes: Scenes in which to tell it every instruction, if there are several.
+        episodes: Episodes for each sentence.
+        scenes: Scenes in which to give it every sentence, if there are several.
     """
-    agent, config, facts = checkpoint.load_policy(run / "best.safetensors")
-    config = dataclasses.replace(config, out=f"runs/{config.env_id}")
-    env_id, steps = config.env_id, facts["steps"]
+    stored = halved(checkpoint.read(run / "best.safetensors"))
+    with tempfile.TemporaryDirectory() as folder:
+        checkpoint.write(path := Path(folder) / "rounded.safetensors", stored)
+        agent, config, facts = checkpoint.load_policy(path)
     play: dict[str, Any] = {
+        "seed": EVALUATION_SEED,
         "frames": config.frames,
         "env_kwargs": config.env_kwargs(training=False),
         "progress": True,
     }
-    states = seen(agent.policy, env_id, seed=config.eval_seed, **play)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "rounded.safetensors"
-        checkpoint.save_policy(
-            path, agent, config, steps=steps, evaluation={}, states=states
-        )
-        stored = checkpoint.read(path)
-        rounded, *_ = checkpoint.load_policy(path)
-    play["seed"] = EVALUATION_SEED
-    sentences = len(catalog.get(env_id).sentences)
-    report = evaluate_policy(
-        rounded.policy, env_id, episodes=episodes * sentences, **play
-    )
+    task, sentences = config.env_id, len(catalog.get(config.env_id).sentences)
+    report = evaluate_policy(agent.policy, task, episodes=episodes * sentences, **play)
     figures = {**report.as_dict(), "commit": _commit()}
     if sentences > 1:
-        same = evaluate_scenes(rounded.policy, env_id, scenes=scenes, **play)
+        same = evaluate_scenes(agent.policy, task, scenes=scenes, **play)
         figures["same_scene"] = same.as_dict()
-    path = FOLDER / f"{env_id}.safetensors"
+    # Only now: what shipped before stays until the new figures are there.
+    path = FOLDER / f"{task}.safetensors"
     path.parent.mkdir(exist_ok=True)
     metadata = {**stored.metadata, "evaluation": figures}
     checkpoint.write(path, dataclasses.replace(stored, metadata=metadata))
-    about = {"run": run.resolve().name, "steps": steps}
-    about["training_seed"] = config.seed
-    path.with_suffix(".json").write_text(
-        json.dumps({**about, **figures}, indent=2) + "\n"
-    )
+    origin = {"run": run.resolve().name, "steps": facts["steps"]}
+    origin["training_seed"] = config.seed
+    text = json.dumps({**origin, **figures}, indent=2)
+    path.with_suffix(".json").write_text(text + "\n")
     return report
 
 
-def seen(policy: Policy, env_id: str, **play: Any) -> State:
-    """Return the states [N, ...] that a policy comes to in the scenes it is chosen by.
-
-    Args:
-        policy: Acts without noise.
-        env_id: The task.
-        **play: Whatever else `evaluate_policy` needs.
-    """
-    states: list[State] = []
-
-    def watched(state: State) -> Tensor:
-        states.append({key: value.clone() for key, value in state.items()})
-        return policy(state)
-
-    evaluate_policy(watched, env_id, episodes=SEEN_EPISODES, **play)
-    return {key: torch.cat([state[key] for state in states]) for key in states[0]}
+def halved(stored: checkpoint.Stored) -> checkpoint.Stored:
+    """Return the contents with 16 bits a weight."""
+    tensors = {
+        name: tensor.half() if tensor.is_floating_point() else tensor
+        for name, tensor in stored.tensors.items()
+    }
+    return dataclasses.replace(stored, tensors=tensors)
 
 
 def _commit() -> str:
-    command = ["git", "rev-parse", "HEAD"]
-    return subprocess.run(
-        command, cwd=FOLDER.parent, capture_output=True, text=True, check=True
-    ).stdout.strip()
+    command = ["git", "-C", str(FOLDER), "rev-parse", "HEAD"]
+    return subprocess.check_output(command, text=True).strip()
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, help="folder of the run")
-    parser.add_argument("--episodes", type=int, default=200, help="per instruction")
-    parser.add_argument("--scenes", type=int, default=200, help="for all instructions")
+    parser.add_argument("--episodes", type=int, default=200, help="per sentence")
+    parser.add_argument("--scenes", type=int, default=200, help="for all sentences")
     given = parser.parse_args()
     print(ship(given.run, given.episodes, given.scenes))

@@ -1,5 +1,12 @@
 """Shared fixtures. Simulated envs are dear, and a process can make only some 25."""
 
+import os
+
+# Several processes run tests: none may take more than its core. Read when torch and the
+# software renderer are loaded, here and in all processes that tests start.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("LP_NUM_THREADS", "0")
+
 from collections.abc import Iterator
 from typing import Any
 

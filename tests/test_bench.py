@@ -1,116 +1,89 @@
 """The benchmark: its arithmetic, and that its blocks do what they are named for."""
 
-import itertools
 import json
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
-from ir_maniskill import cli
-from ir_maniskill.bench import simulation
-from ir_maniskill.bench.report import Machine, Measure, Report
-from ir_maniskill.bench.run import save
-from ir_maniskill.bench.timing import Stopwatch, in_turn, timed
-
-MACHINE = Machine("a processor", 2, 0.5, "a renderer", {"python": "3.11"})
+from ir_maniskill import bench, cli
+from ir_maniskill.bench import Report, Row
+from ir_maniskill.training.config import CONFIGS
 
 
 def test_in_turn_alternates_and_takes_medians():
-    order, a, b = [], iter([1.0, 9.0, 2.0]), iter([5.0, 4.0, 6.0])
+    order, a, b = [], iter([0.5, 9.0, 0.25]), iter([5.0, 2.0, 1.0])
 
-    def block(name, values):
+    def block(name, times):
         def run():
             order.append(name)
-            return next(values)
+            return next(times)
 
         return run
 
-    found = in_turn({"a": block("a", a), "b": block("b", b)}, seconds=0)
-    assert found == {"a": 2.0, "b": 5.0}
+    found = bench.in_turn({"a": block("a", a), "b": block("b", b)}, seconds=0)
+    assert found == {"a": 2.0, "b": 0.5}
     assert order == ["a", "b"] * 3
 
 
-def test_timed_divides_by_the_units():
-    assert 0.005 <= timed(lambda: time.sleep(0.02), units=4) < 0.1
+def test_timed_divides_by_the_steps():
+    assert 0.005 <= bench.timed(lambda: time.sleep(0.02), steps=4) < 0.1
 
 
-def test_stopwatch_counts_nested_time_once(monkeypatch):
-    clock = iter([0.0, 1.0, 4.0, 6.0])  # outer begins, inner begins, ends, outer ends
-    monkeypatch.setattr(time, "perf_counter", lambda: next(clock))
-    watch = Stopwatch()
-    with watch.part("outer"), watch.part("inner"):
-        pass
-    assert watch.seconds == {"outer": 1.0 + 2.0, "inner": 3.0}
+class FakeEnv:
+    """Notes its calls; resets take longer than steps."""
+
+    def __init__(self):
+        self.calls = []
+
+    def reset(self):
+        time.sleep(0.2)
+        self.calls.append("reset")
+
+    def step(self, action):
+        self.calls.append(action)
 
 
-def test_stopwatch_watches_a_method():
-    class Worker:
-        def work(self, value):
-            return 2 * value
-
-    watch, worker = Stopwatch(), Worker()
-    watch.watch(worker, "work", "working")
-    assert worker.work(3) == 6
-    assert watch.seconds["working"] > 0
+def test_resets_are_not_timed(monkeypatch):
+    env = FakeEnv()
+    monkeypatch.setattr(bench, "actions", lambda _, steps: list(range(steps)))
+    env.spec = type("Spec", (), {"max_episode_steps": 5})
+    block = bench.Stepping(env, 2)
+    assert max(block(), block(), block()) < 0.05
+    assert env.calls == ["reset", 0, 1, 2, 3, "reset", 0, 1]
 
 
-def test_the_profile_leaves_resets_out(monkeypatch):
-    def work(*_):
-        pass
-
-    scene = SimpleNamespace(step=work, update_render=work, sensors={})
-    agent = SimpleNamespace(set_action=work)
-    names = "evaluate get_reward _contact_force _get_obs_agent _get_obs_extra"
-    methods = dict.fromkeys([*names.split(), "_fetch_color"], work)
-    base = SimpleNamespace(scene=scene, agent=agent, **methods)
-    env = SimpleNamespace(
-        unwrapped=base,
-        reset=lambda: base.evaluate(),
-        step=lambda _: base.evaluate(),
-        close=work,
+def test_a_report_is_a_table_and_is_saved_as_json(tmp_path):
+    report = Report({"cpus": 2}, (Row("one env", 300.0, "the peer", 10.0),))
+    assert str(report).splitlines()[-1].split() == (
+        ["one", "env", "300.0", "the", "peer", "10.0", "30.00"]
     )
-    monkeypatch.setattr(simulation, "make", lambda *_: env)
-    monkeypatch.setattr(simulation, "actions", lambda _, steps: range(steps))
-    clock = itertools.count(0.0)  # a second passes between two looks
-    monkeypatch.setattr(time, "perf_counter", lambda: next(clock))
-    found = simulation.profile("trivial", seconds=0)
-    assert found == {"Python, all the rest": 2.0, "what contacts mean": 1.0}
-
-
-def test_measures_know_whether_the_goal_is_reached():
-    assert Measure("k", "w", 30, 30).reached
-    assert not Measure("k", "w", 29, 30).reached
-    assert Measure("k", "w", 4, 5, at_most=True).reached
-    assert not Measure("k", "w", 6, 5, at_most=True).reached
-
-
-def test_report_is_saved_as_json(tmp_path):
-    report = Report(MACHINE, (Measure("k", "w", 2.0, 1.0),), {"physics": 0.001})
-    save(report, tmp_path / "new" / "bench.json")
+    bench.save(report, tmp_path / "new" / "bench.json")
     read = json.loads((tmp_path / "new" / "bench.json").read_text())
-    assert read["measures"][0]["value"] == 2.0
-    assert read["measures"][0]["reached"] is True
-    assert read["machine"]["cores"] == 2
-    assert "physics" in str(report)
-
-
-def test_machine_facts_are_there():
-    machine = Machine.here()
-    assert machine.cores >= 1
-    assert machine.versions["sapien"]
+    assert read["rows"][0]["ratio"] == 30.0 and read["machine"] == {"cpus": 2}
 
 
 @pytest.mark.render
 def test_bare_loop_drives_the_same_motion(multi_env):
     multi_env.reset(seed=0)
-    bare = simulation.BareLoop(multi_env)
+    bare = bench.BareLoop(multi_env)
     robot = multi_env.unwrapped.agent.robot
     after_env = robot.get_qpos().clone()
     assert bare() > 0
     # Starts differ by their jitter only: the same targets lead to about the same end.
     assert (robot.get_qpos() - after_env).abs().median() < 0.1
+
+
+def test_training_is_timed_by_what_it_logs(monkeypatch):
+    def train(config):
+        assert config.total_steps == 3 * config.steps_per_update
+        rows = ["steps,time/collect,time/update", "1,2,2", "2,4,4", "3,9,9"]
+        (Path(config.out) / "metrics.csv").write_text("\n".join(rows) + "\n")
+
+    monkeypatch.setattr(bench, "train", train)
+    steps = CONFIGS["default"].steps_per_update
+    (row,) = bench.training(updates=3)
+    assert (row.speed, row.speed_beside) == (steps / 8, steps / 4)  # medians
 
 
 def test_command_line_reads_its_options():

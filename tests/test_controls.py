@@ -4,11 +4,10 @@ import controls
 import pytest
 import torch
 
-from ir_maniskill.environment.instructional_set import InstructionalSet
 from ir_maniskill.experiment import get
 
 TASK = get("NaoTouchCubeTriangle-v1")
-TOKENS = InstructionalSet(TASK, torch.device("cpu")).tokens
+TOKENS = controls.tokens_of(TASK)
 
 
 def state(told=0):

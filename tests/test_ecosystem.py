@@ -20,7 +20,7 @@ from mani_skill.utils.wrappers import (
 )
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
-from ir_maniskill import Experiment, Instruction, TouchObject, register
+from ir_maniskill import Experiment, Instruction, Ref, Touch, TouchObject, register
 from ir_maniskill.experiment import VOCABULARY
 
 STEPS = 16
@@ -40,8 +40,8 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     lemon = TouchObject("yellow", (0.21, 0.06))
     plum = TouchObject("purple", (0.21, -0.06))
     sentences = (
-        Instruction("Touch the lemon.", target=lemon.name),
-        Instruction("Touch the plum, not the lemon.", target=plum.name),
+        Instruction("Touch the lemon.", Touch(Ref("yellow"))),
+        Instruction("Touch the plum, not the lemon.", Touch(Ref("purple"))),
     )
     words = (*VOCABULARY, "plum", "lemon", "not")
     register(Experiment("RecordFruit-v1", (lemon, plum), sentences, vocabulary=words))
@@ -137,6 +137,22 @@ def test_a_row_of_a_recording_restores_the_whole_state(recorded: Path) -> None:
         state = common.flatten_state_dict(state, use_torch=True)
         torch.testing.assert_close(env.get_state(), state)
     env.close()
+
+
+@pytest.mark.render
+def test_maniskill_writes_our_info_into_its_videos(tmp_path: Path) -> None:
+    camera = {"width": 64, "height": 64, "shader_pack": "trivial"}
+    env: Any = gym.make(
+        "NaoTouchCubeMulti-v1",
+        obs_mode="none",
+        render_mode="rgb_array",
+        human_render_camera_configs=camera,
+    )
+    env = RecordEpisode(env, str(tmp_path), save_trajectory=False, info_on_video=True)
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    env.close()
+    assert (tmp_path / "0.mp4").stat().st_size > 1000
 
 
 # -- ManiSkill's PPO layout ------------------------------------------------------------

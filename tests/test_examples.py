@@ -13,8 +13,6 @@ from types import SimpleNamespace
 import pytest
 
 from ir_maniskill import available, cli
-from ir_maniskill.environment.robots.nao import ARM, HAND
-from ir_maniskill.experiment import get
 from ir_maniskill.training.config import CONFIGS
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -52,28 +50,6 @@ def run(folder: Path, *command: str) -> str:
 
 def script(name: str) -> str:
     return str(EXAMPLES / name)
-
-
-def test_every_example_says_how_to_run_it() -> None:
-    names = sorted(path.name for path in EXAMPLES.glob("*.py"))
-    assert names == [
-        "custom_experiment.py",
-        "evaluate_and_record.py",
-        "maniskill_ppo.py",
-        "random_actions.py",
-        "record_and_replay.py",
-        "sb3_ppo.py",
-        "train.py",
-        "vector_envs.py",
-    ]
-    for name in names:
-        text = (EXAMPLES / name).read_text()
-        assert f"python examples/{name}" in text
-        assert 'if __name__ == "__main__":' in text
-
-
-def test_custom_experiment_takes_less_than_forty_lines() -> None:
-    assert len((EXAMPLES / "custom_experiment.py").read_text().splitlines()) < 40
 
 
 def test_train_knows_the_three_experiments_of_the_paper() -> None:
@@ -173,50 +149,6 @@ ROOT = EXAMPLES.parent
 README = (ROOT / "README.md").read_text()
 
 
-def row(start: str) -> list[str]:
-    """Return the cells of the README's table row that begins so."""
-    (line,) = (s for s in README.splitlines() if s.startswith(f"| {start} |"))
-    return [cell.strip() for cell in line.strip("|").split("|")]
-
-
-def test_readme_lists_every_task_with_its_sentences() -> None:
-    row = r"^\| `(Nao\w+-v1)` \| (?:line|triangle) of [^|]+ \| (\d)"
-    listed = re.findall(row, README, re.MULTILINE)
-    sentences = {name: str(len(get(name).sentences)) for name in available()}
-    assert dict(listed) == {k: v for k, v in sentences.items() if k.startswith("Nao")}
-
-
-def test_readme_tells_the_numbers_of_the_presets() -> None:
-    for column, preset in ((2, "paper"), (3, "default")):
-        config = CONFIGS[preset]
-        ppo, agent = config.ppo, config.agent
-        size = f"{config.camera_height} x {config.camera_width}"
-        expected = {
-            "action": f"`{config.control_mode}`",
-            "reward": f"`{config.reward_mode}`",
-            "image, high x wide": size,
-            "light": f"`{config.shader_pack}`",
-            "action noise": f"{agent.std}",
-            "roll-outs an update": f"{ppo.rollouts}",
-            "epochs": f"{ppo.epochs}",
-            "learning rate": f"about {ppo.target_kl}" if ppo.target_kl else "",
-            "minibatch": f"{ppo.minibatch or 'all steps'}",
-            "advantage": f"λ = {ppo.gae_lambda:g}",
-            "discount γ": f"{ppo.gamma}",
-            "clip": f"{ppo.clip}",
-            "gradient norm": f"{ppo.max_grad_norm or 'any'}",
-            "steps": f"{config.total_steps // 1000} k",
-        }
-        for start, text in expected.items():
-            assert text in row(start)[column], start
-        rate = row("learning rate")[column].split()[0]
-        assert float(rate) == ppo.learning_rate
-    assert row("action noise")[3].endswith(
-        f"falling to {CONFIGS['default'].agent.std_final}"
-    )
-    assert f"at most {HAND.delta} of" in README and HAND.delta == ARM.delta
-
-
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
 
 
@@ -248,9 +180,8 @@ COMMAND = re.compile(r"^(?: {4}|.*--no-python |)ir-maniskill (.+)$", re.MULTILIN
 
 def test_the_commands_of_the_pages_are_understood() -> None:
     text = "\n".join(page.read_text() for page in PAGES).replace("\\\n", "")
-    before, recorded, after = re.split("<!-- (?:begin|end) commands -->", text)
-    commands = COMMAND.findall(before + after)  # the recorded runs' have their own test
-    assert COMMAND.findall(recorded) and len(commands) > 10
+    commands = COMMAND.findall(text)
+    assert len(commands) > 10
     for command in commands:
         try:
             cli.parse(shlex.split(command, comments=True))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,12 @@ COLORS = ("#2f6fde", "#22a06b", "#9aa3b2")
 """One for each of TRAINING."""
 CURVE_COLORS = ("#2f6fde", "#d9730d", "#22a06b", "#8250df", "#9aa3b2")
 """Colors of compared curves, in turn."""
+COMPARED = (
+    ("eval/success", "Success [%]", 100),
+    ("eval/exclusive", "Exclusive [%]", 100),
+    ("eval/right_fingers", "Fingers on the object", 1),
+)
+"""Columns of evaluations.csv in which runs are compared, their names and scales."""
 INK = "#24292f"
 """Axes and text."""
 
@@ -94,7 +101,9 @@ class Curve:
         return steps, np.array(values)
 
 
-def compare(curves: Sequence[Curve], out: Path, level: float | None = None) -> Path:
+def compare(
+    curves: Sequence[Curve], out: Path, title: str, level: float | None = None
+) -> Path:
     """Draw ways of learning side by side.
 
     Each has a line for the mean of its runs and a band for their range, as far as all
@@ -103,14 +112,18 @@ def compare(curves: Sequence[Curve], out: Path, level: float | None = None) -> P
     Args:
         curves: At least one.
         out: Picture to write.
+        title: What stands above, the task for instance.
         level: Fingers a step to mark as the paper's; None: no such line.
     """
-    figure = Figure(figsize=(8.0, 5.2), dpi=110, layout="constrained")
-    shares, fingers = figure.subplots(2, 1, sharex=True)
-    for index, curve in enumerate(curves):
-        color = CURVE_COLORS[index % len(CURVE_COLORS)]
-        _draw_range(shares, curve, "eval/exclusive", 100, color)
-        _draw_range(fingers, curve, "eval/right_fingers", 1, color)
+    figure = Figure(figsize=(8.0, 6.2), dpi=100, layout="constrained")
+    panels = figure.subplots(3, 1, sharex=True)
+    for axes, (column, name, scale) in zip(panels, COMPARED, strict=True):
+        for curve, color in zip(curves, cycle(CURVE_COLORS)):
+            _draw_range(axes, curve, column, scale, color)
+        axes.set_ylabel(name)
+        axes.set_ylim((-3, 103) if scale == 100 else (0, None))
+        _polish(axes)
+    fingers = panels[-1]
     if level is not None:
         fingers.axhline(level, color=INK, linewidth=1.2, linestyle="--")
         fingers.annotate(
@@ -123,21 +136,16 @@ def compare(curves: Sequence[Curve], out: Path, level: float | None = None) -> P
             color=INK,
             fontsize=8.5,
         )
-    shares.set_ylim(-3, 103)
-    shares.set_ylabel("Exclusive success [%]")
-    fingers.set_ylim(bottom=0)
-    fingers.set_ylabel("Right fingers a step")
     fingers.set_xlim(left=0)
     fingers.set_xlabel("Environment steps")
+    figure.suptitle(title, color=INK)
     figure.legend(
-        *shares.get_legend_handles_labels(),
-        loc="outside upper left",
+        *fingers.get_legend_handles_labels(),
+        loc="outside lower center",
+        ncols=len(curves),
         frameon=False,
-        fontsize=8.5,
         labelcolor=INK,
     )
-    for axes in (shares, fingers):
-        _polish(axes)
     out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(out)
     return out
@@ -150,8 +158,8 @@ def _draw_range(
     values = scale * values
     common = np.isfinite(values).all(axis=0)  # steps that every seed has reached
     shared = values[:, common]
-    runs = f"{len(curve.runs)} run{'s' if len(curve.runs) > 1 else ''}"
-    label = f"{curve.label} ({runs})"
+    seeds = f"{len(curve.runs)} seed{'s' if len(curve.runs) > 1 else ''}"
+    label = f"{curve.label} ({seeds})"
     mean, low, high = shared.mean(axis=0), shared.min(axis=0), shared.max(axis=0)
     axes.plot(steps[common], mean, "o-", color=color, ms=3, label=label)
     axes.fill_between(steps[common], low, high, color=color, alpha=0.18, linewidth=0)

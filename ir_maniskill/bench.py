@@ -1,0 +1,303 @@
+"""How fast the project is: steps/s beside something that does the same work.
+
+Absolute speed says more about the machine than about the code. So whatever is compared
+takes turns in short blocks, medians are taken, and the ratio is what counts.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, closing
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from ir_maniskill.environment.vector import make_vec
+from ir_maniskill.evaluation.evaluate import machine, versions
+from ir_maniskill.training.config import CONFIGS, TrainConfig
+from ir_maniskill.training.run_folder import whole_rows
+from ir_maniskill.training.train import train
+
+OURS = "NaoTouchCubeTriangle-v1"
+PEER = "mani_skill.envs:UnitreeG1PlaceAppleInBowl-v1"
+"""A humanoid task of ManiSkill's; it too looks through two cameras at 128 x 128."""
+BARE = "physics and drawing alone"
+SHADER = "unlit"
+"""Shader pack of all pictures: the cheapest."""
+SIDE = 128
+"""Height and width of the pictures that are compared [pixel]."""
+EPISODE = 32
+"""Steps of an episode of ours."""
+ENVS_EACH = 8
+"""Envs of each worker process, as in a training with default settings on two cores."""
+
+Block = Callable[[], float]
+"""Makes some steps and returns how long one of them took [s]."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table."""
+
+    what: str
+    """What was measured."""
+    speed: float
+    """Its speed [steps/s]."""
+    beside: str
+    """What took turns with it."""
+    speed_beside: float
+    """The speed of that [steps/s]."""
+
+    @property
+    def ratio(self) -> float:
+        """How many times as fast it is."""
+        return self.speed / self.speed_beside
+
+    def __str__(self) -> str:
+        return (
+            f"{self.what:42} {self.speed:8.1f}   {self.beside:32} "
+            f"{self.speed_beside:8.1f} {self.ratio:7.2f}"
+        )
+
+
+@dataclass(frozen=True)
+class Report:
+    """All that one run of the benchmark found."""
+
+    machine: dict[str, Any]
+    """Where it was measured, and with which versions."""
+    rows: tuple[Row, ...]
+    """The table."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain data for JSON."""
+        rows = [asdict(row) | {"ratio": row.ratio} for row in self.rows]
+        return {"machine": self.machine, "rows": rows}
+
+    def __str__(self) -> str:
+        facts = ", ".join(f"{name} {fact}" for name, fact in self.machine.items())
+        head = f"{'':42} {'steps/s':>8}   {'beside':32} {'steps/s':>8} {'ratio':>7}"
+        return "\n".join([facts, "", head, *map(str, self.rows)])
+
+
+# -- The table -------------------------------------------------------------------------
+
+
+def run(seconds: float = 10.0, quick: bool = False) -> Report:
+    """Measure everything.
+
+    Args:
+        seconds: How long each comparison goes on [s].
+        quick: Whether to measure as briefly as possible, without the peer, which takes
+            long to load.
+    """
+    seconds = 1.0 if quick else seconds
+    jobs: tuple[Callable[[], Iterator[Row]], ...] = (
+        lambda: one_env("state", seconds, peer=not quick),
+        lambda: one_env("rgb", seconds, peer=not quick),
+        lambda: many_envs(seconds),
+        lambda: training(updates=1 if quick else 3),
+    )
+    rows: list[Row] = []
+    for job in tqdm(jobs, desc="bench"):
+        rows += job()
+    facts = {**machine(), "load": round(os.getloadavg()[0], 1), **versions()}
+    return Report(facts, tuple(rows))
+
+
+def one_env(obs_mode: str, seconds: float, peer: bool) -> Iterator[Row]:
+    """Compare one env with the peer and, with pictures, with SAPIEN alone."""
+    with ExitStack() as stack:
+        env = stack.enter_context(closing(make(OURS, obs_mode)))
+        blocks: dict[str, Block] = {OURS: Stepping(env, EPISODE)}
+        if peer:
+            other = stack.enter_context(closing(make(PEER, obs_mode)))
+            # A block of the peer's pictures takes as long as one of ours: few steps.
+            blocks[PEER] = Stepping(other, 2 if obs_mode == "rgb" else EPISODE)
+        if obs_mode == "rgb":
+            blocks[BARE] = BareLoop(env)
+        speed = in_turn(blocks, seconds)
+    kind = f"two {SIDE} x {SIDE} pictures" if obs_mode == "rgb" else "state"
+    for name in list(blocks)[1:]:
+        beside = name.split(":")[-1].removesuffix("-v1")
+        yield Row(f"one env, {kind}", speed[OURS], beside, speed[name])
+
+
+def many_envs(seconds: float) -> Iterator[Row]:
+    """Compare a worker process on every core with one."""
+    cores = len(os.sched_getaffinity(0))
+    total = ENVS_EACH * cores
+    with (
+        closing(make_many(total, cores)) as envs,
+        closing(make_many(ENVS_EACH, 1)) as few,
+    ):
+        blocks = {"all": stepping_many(envs), "one": stepping_many(few)}
+        speed = in_turn(blocks, seconds)
+    what = f"{total} envs, {cores} processes, pictures 64 x 32"
+    yield Row(what, speed["all"], f"{ENVS_EACH} envs, one process", speed["one"])
+
+
+def training(updates: int, config: TrainConfig = CONFIGS["default"]) -> Iterator[Row]:
+    """Compare training with collecting alone, by the times that a run logs."""
+    with tempfile.TemporaryDirectory() as folder:
+        config = replace(
+            config,
+            env_id=OURS,
+            out=folder,
+            total_steps=updates * config.steps_per_update,
+            eval_episodes=3,
+        )
+        train(config)
+        rows = list(whole_rows(Path(folder) / "metrics.csv"))
+    collect, update = (
+        [float(row[f"time/{name}"]) for row in rows] for name in ("collect", "update")
+    )
+    both = [sum(pair) for pair in zip(collect, update, strict=True)]
+    steps = config.steps_per_update
+    speed, alone = (steps / statistics.median(times) for times in (both, collect))
+    yield Row("training, preset `default`", speed, "its envs and actions alone", alone)
+
+
+# -- Timing ----------------------------------------------------------------------------
+
+
+def in_turn(blocks: Mapping[str, Block], seconds: float) -> dict[str, float]:
+    """Run the blocks in turn and return the median speed of each [steps/s].
+
+    Whatever else runs on the machine slows all of them alike, so that ratios stay.
+
+    Args:
+        blocks: What to compare, by name. One may stand for another version of this
+            project, which a process of its own steps.
+        seconds: How long to go on; every block runs at least three times.
+    """
+    samples: dict[str, list[float]] = {name: [] for name in blocks}
+    end = time.perf_counter() + seconds
+    while min(map(len, samples.values())) < 3 or time.perf_counter() < end:
+        for name, block in blocks.items():
+            samples[name].append(block())
+    return {name: 1 / statistics.median(times) for name, times in samples.items()}
+
+
+def timed(work: Callable[[], Any], steps: int) -> float:
+    """Return how long a step of this work takes [s]."""
+    start = time.perf_counter()
+    work()
+    return (time.perf_counter() - start) / steps
+
+
+# -- What is stepped -------------------------------------------------------------------
+
+
+def make(task: str, obs_mode: str) -> Any:
+    """Make one env on the CPU and step it once, which compiles its shaders."""
+    cameras = {"width": SIDE, "height": SIDE, "shader_pack": SHADER}
+    env = gym.make(
+        task,
+        obs_mode=obs_mode,
+        num_envs=1,
+        sim_backend="physx_cpu",
+        render_backend="cpu",
+        sensor_configs=cameras if obs_mode == "rgb" else {},
+    )
+    env.reset(seed=0)
+    env.step(actions(env, 1)[0])
+    return env
+
+
+def make_many(num_envs: int, workers: int) -> Any:
+    """Make a vector of envs with small pictures."""
+    cameras = {"width": 32, "height": 64, "shader_pack": SHADER}
+    kwargs: dict[str, Any] = {"obs_mode": "rgb", "sensor_configs": cameras}
+    return make_vec(
+        OURS, num_envs, num_workers=workers, sim_backend="physx_cpu", **kwargs
+    )
+
+
+def actions(env: Any, steps: int) -> np.ndarray:
+    """Return pinned random actions [T, J]."""
+    env.action_space.seed(0)
+    return np.stack([env.action_space.sample() for _ in range(steps)])
+
+
+class Stepping:
+    """A block that steps one env, episode after episode; resets are not timed."""
+
+    def __init__(self, env: Any, steps: int) -> None:
+        """Plan the actions of an episode, of which a block makes some steps."""
+        length = env.spec.max_episode_steps or EPISODE
+        self._env, self._steps, self._done = env, steps, length
+        self._plan = actions(env, length)
+
+    def __call__(self) -> float:
+        """Return the time of a step [s]."""
+        if self._done + self._steps > len(self._plan):
+            self._env.reset()
+            self._done = 0
+        part = self._plan[self._done : self._done + self._steps]
+        self._done += self._steps
+        return timed(lambda: [self._env.step(action) for action in part], self._steps)
+
+
+class BareLoop:
+    """A block that drives an env's SAPIEN objects as a program without ManiSkill would.
+
+    The joints get the targets that the env gives them for the actions of `Stepping`,
+    so that the physics is the same; the same two pictures are drawn and fetched.
+    """
+
+    def __init__(self, env: Any) -> None:
+        """Record the targets of one episode."""
+        base, self._env = env.unwrapped, env
+        self._substeps = base.sim_freq // base.control_freq
+        self._physics, (self._scene,) = base.scene.px, base.scene.sub_scenes
+        sensors = base.scene.sensors.values()
+        self._cameras = [sensor.camera._render_cameras[0] for sensor in sensors]
+        self._joints = [joint._objs[0] for joint in base.agent.controller.joints]
+        self._targets: list[list[float]] = []
+        env.reset()
+        for action in actions(env, EPISODE):
+            env.step(action)
+            self._targets.append(base.agent.controller.target[0].tolist())
+
+    def __call__(self) -> float:
+        """Return the time of a step [s]."""
+        self._env.reset()
+        return timed(self._episode, EPISODE)
+
+    def _episode(self) -> None:
+        for targets in self._targets:
+            for joint, target in zip(self._joints, targets, strict=True):
+                joint.set_drive_target(target)
+            for _ in range(self._substeps):
+                self._physics.step()
+            self._scene.update_render()
+            for camera in self._cameras:
+                camera.take_picture()
+            for camera in self._cameras:
+                camera.get_picture("Color")
+
+
+def stepping_many(envs: Any) -> Block:
+    """Return a block that steps all envs of a vector for an episode."""
+    plan = torch.rand(EPISODE, *envs.action_space.shape) * 2 - 1
+    envs.reset(seed=0)
+    return lambda: timed(
+        lambda: [envs.step(action) for action in plan], EPISODE * envs.num_envs
+    )
+
+
+def save(report: Report, path: Path) -> None:
+    """Write the report as JSON."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(report.as_dict(), indent=2) + "\n")
