@@ -238,10 +238,6 @@ class ProcessVectorEnv(VectorEnv):
         """Return the attribute of each env (N values), as `call` does."""
         return self.call(name)
 
-    def set_attr(self, name: str, values: Any) -> None:
-        """Set an attribute of every env."""
-        self._command("set_attr", [(name, values)] * len(self._pipes))
-
     def close_extras(self, **kwargs: Any) -> None:
         """End all workers; none is left behind, whatever state it is in."""
         for pipe in self._pipes:

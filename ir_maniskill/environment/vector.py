@@ -131,10 +131,6 @@ class GpuVectorEnv(ManiSkillVectorEnv):
             info |= final_infos(obs_then, info_then, info["_final_info"])
         return obs, reward, terminated, truncated, info
 
-    def set_attr(self, name: str, values: Any) -> None:
-        """Set an attribute of the batched env."""
-        setattr(self.base_env, name, values)
-
     def get_attr(self, name: str) -> Any:
         """Return the attribute, which all envs of the batch share."""
         return self._env.get_wrapper_attr(name)

@@ -99,11 +99,6 @@ class _Worker:
             else:
                 self._shared.write(row, ends | {"obs": obs, "info": info})
 
-    def set_attr(self, argument: tuple[str, Any]) -> None:
-        """Set an attribute of every env."""
-        for env in self._envs:
-            setattr(env.unwrapped, *argument)
-
     def call(self, argument: tuple[str, tuple, dict]) -> list:
         """Call a method of every env, or get an attribute."""
         name, args, kwargs = argument
