@@ -141,7 +141,7 @@ def sentences_table(policies: Mapping[str, Any]) -> str:
     for task, figures in policies.items():
         for sentence, score in figures["instructions"].items():
             shares = [_share(score, name) for name in RATES]
-            held = f"{score['touching']:.0%}", f"{score['right_fingers']:.1f}"
+            held = f"{score['holding']:.0%}", f"{score['right_fingers']:.1f}"
             rows.append((f"`{task}`", _named(sentence), *shares, *held))
     head = "task | named | success | exclusive | in touch | fingers"
     return table(head, rows)

@@ -27,7 +27,7 @@ def score(success=1.0, exclusive=0.5, fingers=3.0):
     return {
         **{"success": success, "success_interval": [success - 0.1, success]},
         **{"exclusive": exclusive, "exclusive_interval": [exclusive - 0.1, exclusive]},
-        **{"touching": 0.8, "right_fingers": fingers},
+        **{"holding": 0.8, "right_fingers": fingers},
     }
 
 
