@@ -86,7 +86,7 @@ def build_room(scene: ManiSkillScene, robot: Robot) -> Actor:
     if robot.stand and scene.can_render():
         x, y, top = robot.mount.p
         ground = scale * SOLE_HEIGHT
-        half = [robot.stand / 2, robot.stand / 2, (top - ground) / 2]
+        half = np.array([robot.stand, robot.stand, top - ground]) / 2
         pose = sapien.Pose([x, y, (top + ground) / 2])
         builder.add_box_visual(pose, half_size=half, material=_paint(STAND_COLOR))
     builder.initial_pose = sapien.Pose()

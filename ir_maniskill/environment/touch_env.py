@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
-import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import CameraConfig

@@ -27,6 +27,8 @@ class RobotError(ValueError):
 class Motor:
     """What moves a joint; SAPIEN's loader takes over its range alone."""
 
+    slides: bool
+    """Whether the joint is prismatic."""
     lower: float
     """Least position [rad], of a slide [m]."""
     upper: float
@@ -35,8 +37,6 @@ class Motor:
     """Largest torque [N m], of a slide force [N]."""
     velocity: float
     """Largest speed [rad/s], of a slide [m/s]."""
-    slides: bool
-    """Whether the joint is prismatic."""
 
 
 def read_urdf(path: Path) -> Element:
@@ -84,7 +84,7 @@ def _read_motor(joint: Element, path: Path) -> Motor:
     except (KeyError, ValueError):
         numbers = [math.nan]
     if kind in ("revolute", "prismatic") and all(map(math.isfinite, numbers)):
-        motor = Motor(*numbers, slides=kind == "prismatic")
+        motor = Motor(kind == "prismatic", *numbers)
         if motor.lower < motor.upper and motor.effort > 0 and motor.velocity > 0:
             return motor
     shown = " ".join(f'{name}="{value}"' for name, value in given.items())
@@ -124,7 +124,7 @@ def read_builder(
     try:
         (builder,) = loader.parse(path)["articulation_builders"]
     except Exception as error:  # of urchin, lxml or SAPIEN, and of any kind
-        raise RobotError(f"{path}: not a robot that SAPIEN can load: {error}") from error
+        raise RobotError(f"{path}: SAPIEN cannot load it: {error!r}") from error
     builder.mimic_joint_records.clear()
     for link in builder.link_builders:
         joint = link.joint_record

@@ -19,7 +19,7 @@ import sapien
 import torch
 from mani_skill.agents.base_agent import BaseAgent, Keyframe
 from mani_skill.agents.registration import REGISTERED_AGENTS
-from mani_skill.utils.structs import Actor, Link
+from mani_skill.utils.structs import Actor
 from torch import Tensor
 
 from ir_maniskill.environment import contacts
@@ -74,7 +74,7 @@ class Robot(BaseAgent, ABC):
     mount: sapien.Pose = sapien.Pose()
     """Where the root link stands in the world."""
     stand: float = 0.0
-    """Width of the pillar under the root link; 0 if it stands on feet of its own [m]."""
+    """Width of the pillar under the root link, 0 if there are feet [m]."""
     rebound: float = math.inf
     """Fastest that a link is pushed out of what it got into; a strong arm with light
     fingers explodes without a limit [m/s]."""
@@ -135,7 +135,7 @@ class Robot(BaseAgent, ABC):
         self._shapes = {b.name: len(b.collision_records) for b in builder.link_builders}
 
     def _require_shapes(self) -> None:
-        """Raise unless SAPIEN made all collision shapes; it is silent about failures."""
+        """Raise unless all collision shapes were made: SAPIEN says nothing if not."""
         links = self.robot.links_map
         made = {n: len(links[n]._bodies[0].collision_shapes) for n in self._shapes}
         broken = [name for name, count in self._shapes.items() if made[name] < count]
@@ -148,8 +148,8 @@ class Robot(BaseAgent, ABC):
             names = self._phalanges_of(finger)
             if not any(made[name] for name in names):
                 raise RobotError(
-                    f"{self.urdf_path}: finger {finger!r} of the robot {self.uid!r}: no "
-                    f"collision shape in {', '.join(names)}, hence it would feel nothing"
+                    f"{self.urdf_path}: finger {finger!r} of the robot {self.uid!r}: "
+                    f"no collision shape in {', '.join(names)}, so it feels nothing"
                 )
 
     def _after_loading_articulation(self) -> None:
@@ -176,9 +176,9 @@ class Robot(BaseAgent, ABC):
         self._order = controller.active_joint_indices  # [J] action order -> qpos
         self._middle = (controller.lower + controller.upper) / 2  # [J] [rad]
         self._half_range = (controller.upper - controller.lower) / 2  # [J] [rad]
-        slides = [self._motors[name].slides for name in self.joints]
-        slides = torch.tensor(slides, device=self.device)
-        unit = torch.where(slides, self._half_range / (math.pi / 2), 1.0)
+        slides = torch.tensor([self._motors[name].slides for name in self.joints])
+        unit = self._half_range / (math.pi / 2)
+        unit = unit.where(slides.to(self.device), 1.0)
         self.jitter_unit = self.to_qpos(unit)
         self.keyframes = {
             name: self._keyframe(angles) for name, angles in self.postures.items()
@@ -308,10 +308,10 @@ class Robot(BaseAgent, ABC):
         return ((position - self._middle) / self._half_range).clamp(-1, 1)
 
 
-def available_robots() -> tuple[str, ...]:
-    """Return the uids of the registered robots that the tasks can use."""
+def available_robots() -> dict[str, type[Robot]]:
+    """Return the registered robots that the tasks can use, by uid."""
     agents = {uid: spec.agent_cls for uid, spec in REGISTERED_AGENTS.items()}
-    return tuple(uid for uid, cls in agents.items() if issubclass(cls, Robot))
+    return {uid: cls for uid, cls in agents.items() if issubclass(cls, Robot)}
 
 
 def find_robot(robot: str | type[BaseAgent]) -> str | type[Robot]:
@@ -326,14 +326,14 @@ def find_robot(robot: str | type[BaseAgent]) -> str | type[Robot]:
     """
     if isinstance(robot, type) and issubclass(robot, Robot):
         return robot
-    known = {short_name(uid): uid for uid in available_robots()}
-    known |= {uid: uid for uid in available_robots()}
-    if robot not in known:
-        raise RobotError(
-            f"robot_uids: got {robot!r}, expected a subclass of Robot or the name of a "
-            f"registered one, available: {', '.join(map(short_name, available_robots()))}"
-        )
-    return known[robot]
+    uids = available_robots()
+    for uid in uids:
+        if robot in (uid, short_name(uid)):
+            return uid
+    raise RobotError(
+        f"robot_uids: got {robot!r}, expected a subclass of Robot or the name of a "
+        f"registered one, available: {', '.join(map(short_name, uids))}"
+    )
 
 
 OURS = "ir_"

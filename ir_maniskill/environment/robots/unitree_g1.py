@@ -39,6 +39,8 @@ PHALANGES = {
     for finger, links in LINKS.items()
 }
 
+FINGERTIPS = {finger: links[-1] for finger, links in PHALANGES.items()}
+
 # -- Actuation -----------------------------------------------------------------------
 
 ARM = JointGroup(stiffness=100, damping=10, armature=3e-2, delta=0.1, speed=8)
@@ -92,7 +94,7 @@ class UnitreeG1(Robot):
     joints = JOINTS
     hands = HANDS
     phalanges = PHALANGES
-    fingertips = {finger: links[-1] for finger, links in PHALANGES.items()}
+    fingertips = FINGERTIPS
     postures = POSTURES
     mount = sapien.Pose([SHOULDER_X, 0, SCALE * SOLE_HEIGHT - SOLE])
     rebound = 1.0
