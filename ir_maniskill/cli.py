@@ -19,6 +19,7 @@ from tyro.conf import Positional, arg, subcommand
 from ir_maniskill import doctor
 from ir_maniskill import experiment as catalog
 from ir_maniskill.agent.agent import Agent
+from ir_maniskill.environment.robots.robot import Robot, available_robots, short_name
 from ir_maniskill.evaluation import plots, video
 from ir_maniskill.evaluation.evaluate import (
     EVALUATION_SEED,
@@ -45,7 +46,7 @@ class UsageError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class Tasks:
-    """List the tasks."""
+    """List the tasks, and the robots that can do them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -211,11 +212,25 @@ def parse(arguments: Sequence[str]) -> Any:
 def _tasks(_: Tasks) -> int:
     rows = [("ID", "SENTENCES", "OBJECTS", "REWARD", "SENSES")]
     rows += [_describe(catalog.get(name)) for name in catalog.available()]
+    _print_table(rows)
+    rows = [("ROBOT", "UID", "ACTIONS", "HANDS AND FINGERS", "SCALE")]
+    rows += [_describe_robot(robot) for robot in available_robots().values()]
+    _print_table(rows)
+    return 0
+
+
+def _print_table(rows: Sequence[tuple[str, ...]]) -> None:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
         print("  ".join(cells).rstrip())
-    return 0
+
+
+def _describe_robot(robot: type[Robot]) -> tuple[str, str, str, str, str]:
+    """Return the row of a robot in the table of robots."""
+    hands = (f"{hand}: {', '.join(fingers)}" for hand, fingers in robot.hands.items())
+    name, joints = short_name(robot.uid), str(len(robot.joints))
+    return name, robot.uid, joints, "; ".join(hands), f"{robot.scale:g}"
 
 
 def _describe(experiment: Experiment) -> tuple[str, str, str, str, str]:

@@ -165,7 +165,7 @@ class Experiment:
     sentences if left out."""
 
     def __post_init__(self) -> None:
-        """Check that the experiment can be built, said and reached.
+        """Check that the experiment can be built and said.
 
         Raises:
             ExperimentError: Some field is malformed; the message says which.

@@ -45,10 +45,11 @@ def policy_file(tmp_path):
     return path
 
 
-def test_tasks_lists_all_eight_ids(capsys):
+def test_tasks_lists_all_eight_ids_and_three_robots(capsys):
     assert cli.run(["tasks"]) == 0
-    listed = [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:]]
-    assert set(IDS) <= set(listed)
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()[1:]]
+    assert {*IDS, "nao", "g1", "panda"} <= {row[0] for row in rows}
+    assert ["g1", "ir_g1", "24"] in [row[:3] for row in rows]
 
 
 @pytest.mark.parametrize("command", ["train", "evaluate", "video"])

@@ -5,7 +5,7 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 
-from ir_maniskill.environment.robots.nao import FINGERS
+from ir_maniskill.environment.robots.nao import HANDS
 from ir_maniskill.evaluation import plots, video
 from ir_maniskill.evaluation.evaluate import evaluate_policy
 from ir_maniskill.evaluation.video import (
@@ -25,7 +25,7 @@ def snapshot(step=3, right=(), wrong=(), history=((False, False),) * 3):
         view=gray,
         cameras=(picture, picture),
         instruction="Touch the blue cube.",
-        fingers=FINGERS,
+        hands=HANDS,
         right=tuple(finger in right for finger in range(6)),
         wrong=tuple(finger in wrong for finger in range(6)),
         step=step,
@@ -78,7 +78,7 @@ def test_a_touching_finger_lights_its_own_lamp_only(finger):
 def lit(count, names):
     """Return the share of the lights' card that is green if `count` fingers touch."""
     right = tuple(index < count for index in range(len(names)))
-    shown = {"fingers": names, "right": right, "wrong": (False,) * len(names)}
+    shown = {"hands": {"hand": names}, "right": right, "wrong": (False,) * len(names)}
     frame = draw(Snapshot(**{**vars(snapshot()), **shown}))
     return share(frame, video.HANDS, RIGHT)
 

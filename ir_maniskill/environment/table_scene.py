@@ -1,8 +1,8 @@
 """The stage: a table, a floor, a backdrop, the objects, lights and cameras.
 
-World origin = torso origin of the robot, x forward, y left, z up. Everything that
-never moves is one body, since on software rendering draw calls and vertices are what
-pictures cost.
+World origin = torso origin of NAO, x forward, y left, z up; for another robot all is as
+many times larger as its `scale` says. Everything that never moves is one body, since on
+software rendering draw calls and vertices are what pictures cost.
 """
 
 from __future__ import annotations
@@ -20,9 +20,11 @@ from mani_skill.render.shaders import (
 )
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.sapien_utils import look_at
-from mani_skill.utils.structs import Actor
+from mani_skill.utils.structs import Actor, Pose
 from torch import Tensor
 
+from ir_maniskill.assets.nao import SOLE_HEIGHT
+from ir_maniskill.environment.robots.robot import Robot
 from ir_maniskill.experiment import OBJECT_SIZE, TABLE, TouchObject
 from ir_maniskill.goals import COLORS
 
@@ -34,6 +36,8 @@ OBJECT_HEIGHT = {"cube": OBJECT_SIZE, "button": 0.024}
 """Height of each shape [m]."""
 CUBE_MASS = 0.05
 """[kg]"""
+STAND_COLOR = (0.18, 0.19, 0.21)
+"""Linear RGB of the pillar of a robot that has no feet."""
 
 
 def _rgb(data: Tensor) -> dict[str, Tensor]:
@@ -67,82 +71,103 @@ PREBUILT_SHADER_CONFIGS.setdefault("trivial", TRIVIAL)
 PREBUILT_SHADER_CONFIGS.setdefault("unlit", UNLIT)
 
 
-def build_room(scene: ManiSkillScene) -> Actor:
-    """Build all that never moves: one body, one mesh, one collision box."""
+def build_room(scene: ManiSkillScene, robot: Robot) -> Actor:
+    """Build all that never moves: one body, one mesh, one collision box.
+
+    A robot without feet gets a pillar to stand on.
+    """
     (x0, x1), (y0, y1) = TABLE
-    builder = scene.create_actor_builder()
-    half = [(x1 - x0) / 2, (y1 - y0) / 2, TABLE_THICKNESS / 2]
-    center = [(x0 + x1) / 2, (y0 + y1) / 2, TABLE_TOP - TABLE_THICKNESS / 2]
-    builder.add_box_collision(sapien.Pose(center), half_size=half)
+    scale, builder = robot.scale, scene.create_actor_builder()
+    half = np.array([(x1 - x0) / 2, (y1 - y0) / 2, TABLE_THICKNESS / 2])
+    center = np.array([(x0 + x1) / 2, (y0 + y1) / 2, TABLE_TOP - TABLE_THICKNESS / 2])
+    builder.add_box_collision(sapien.Pose(scale * center), half_size=scale * half)
     mesh = files("ir_maniskill.assets") / "scene" / "room.glb"
-    builder.add_visual_from_file(str(mesh))
+    builder.add_visual_from_file(str(mesh), scale=[scale] * 3)
+    if robot.stand and scene.can_render():
+        x, y, top = robot.mount.p
+        ground = scale * SOLE_HEIGHT
+        half = np.array([robot.stand, robot.stand, top - ground]) / 2
+        pose = sapien.Pose([x, y, (top + ground) / 2])
+        builder.add_box_visual(pose, half_size=half, material=_paint(STAND_COLOR))
     builder.initial_pose = sapien.Pose()
     return builder.build_static(name="room")
 
 
-def build_object(scene: ManiSkillScene, thing: TouchObject) -> Actor:
+def build_object(scene: ManiSkillScene, thing: TouchObject, scale: float) -> Actor:
     """Build one object: a free cube, or a button that stays where it is put."""
     builder = scene.create_actor_builder()
-    height = OBJECT_HEIGHT[thing.shape]
-    builder.initial_pose = sapien.Pose([*thing.position, TABLE_TOP + height / 2])
+    size, height = scale * OBJECT_SIZE, scale * OBJECT_HEIGHT[thing.shape]
+    x, y = thing.position
+    z = TABLE_TOP + OBJECT_HEIGHT[thing.shape] / 2
+    builder.initial_pose = sapien.Pose([scale * x, scale * y, scale * z])
     if thing.shape == "cube":
-        half = [OBJECT_SIZE / 2] * 3
+        half = [size / 2] * 3
         builder.add_box_collision(half_size=half, density=CUBE_MASS / OBJECT_SIZE**3)
         if scene.can_render():
-            builder.add_box_visual(half_size=half, material=_material(thing))
+            builder.add_box_visual(half_size=half, material=_paint(COLORS[thing.color]))
         return builder.build(name=thing.name)
     upright = sapien.Pose(q=[math.sqrt(0.5), 0, -math.sqrt(0.5), 0])
-    builder.add_cylinder_collision(upright, OBJECT_SIZE / 2, height / 2)
+    builder.add_cylinder_collision(upright, size / 2, height / 2)
     if scene.can_render():
         mesh = files("ir_maniskill.assets") / "scene" / "button.glb"
-        builder.add_visual_from_file(str(mesh), material=_material(thing))
+        material = _paint(COLORS[thing.color])
+        builder.add_visual_from_file(str(mesh), scale=[scale] * 3, material=material)
     return builder.build_kinematic(name=thing.name)
 
 
-def _material(thing: TouchObject) -> sapien.render.RenderMaterial:
-    color = [*COLORS[thing.color], 1.0]
-    return sapien.render.RenderMaterial(base_color=color, roughness=0.45, specular=0.4)
+def _paint(color: tuple[float, float, float]) -> sapien.render.RenderMaterial:
+    rgba = [*color, 1.0]
+    return sapien.render.RenderMaterial(base_color=rgba, roughness=0.45, specular=0.4)
 
 
-def add_lights(scene: ManiSkillScene, shadow: bool) -> None:
+def add_lights(scene: ManiSkillScene, scale: float, shadow: bool) -> None:
     """Add a soft ambient light, a key light (with `shadow` or not) and a fill light."""
     scene.set_ambient_light([0.35, 0.35, 0.36])
     scene.add_directional_light(
         [-0.55, -0.35, -1.0],
         [1.9, 1.85, 1.75],
         shadow=shadow,
-        shadow_scale=0.8,
+        shadow_scale=0.8 * scale,
         shadow_map_size=2048,
     )
     scene.add_directional_light([-0.6, 0.9, -0.4], [0.5, 0.52, 0.6])
 
 
-def policy_cameras() -> list[CameraConfig]:
+def policy_cameras(scale: float) -> list[CameraConfig]:
     """Return the two cameras of the Perceptual System (paper, Sec. III-C: K = 2).
 
     512 high, 256 wide by default; both see the whole of the objects' area.
     """
-    top = look_at(eye=[0.18, 0, 0.60], target=[0.17, 0, TABLE_TOP])
-    front = look_at(eye=[0.66, 0, 0.36], target=[0.15, 0, 0.06])
-    size = {"width": 256, "height": 512, "near": 0.02, "far": 5.0}
+    top = view(scale, eye=(0.18, 0, 0.60), target=(0.17, 0, TABLE_TOP))
+    front = view(scale, eye=(0.66, 0, 0.36), target=(0.15, 0, 0.06))
+    size = {"width": 256, "height": 512, "near": 0.02 * scale, "far": 5.0 * scale}
     return [
         CameraConfig(uid="top_camera", pose=top, fov=1.10, **size),
         CameraConfig(uid="front_camera", pose=front, fov=1.10, **size),
     ]
 
 
-def video_camera() -> CameraConfig:
+def video_camera(scale: float) -> CameraConfig:
     """Return the camera for videos: a three-quarter view with the full shader."""
     return CameraConfig(
         uid="render_camera",
-        pose=look_at(eye=[0.72, 0.46, 0.46], target=[0.10, 0.0, 0.06]),
+        pose=view(scale, eye=(0.72, 0.46, 0.46), target=(0.10, 0.0, 0.06)),
         width=960,
         height=720,
         fov=0.75,
-        near=0.02,
-        far=20.0,
+        near=0.02 * scale,
+        far=20.0 * scale,
         shader_pack="default",
     )
+
+
+Point = tuple[float, float, float]
+"""A place at NAO's scale (x, y, z) [m]."""
+
+
+def view(scale: float, eye: Point, target: Point) -> Pose:
+    """Return the pose of a camera that looks from `eye` at `target`."""
+    return look_at([scale * value for value in eye], [scale * v for v in target])
 
 
 def yaw_quaternion(yaw: np.ndarray) -> np.ndarray:

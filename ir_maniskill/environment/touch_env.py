@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
-import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import CameraConfig
@@ -26,12 +25,8 @@ from ir_maniskill.environment.bodies import poses, velocities
 from ir_maniskill.environment.instructional_set import GoalBatch, InstructionalSet
 from ir_maniskill.environment.rendering import RenderedEnv
 from ir_maniskill.environment.reward_generator import RewardWeights
-from ir_maniskill.environment.robots.nao import Nao
-from ir_maniskill.environment.robots.robot import (
-    Robot,
-    available_robots,
-    require_robot,
-)
+from ir_maniskill.environment.robots import Nao
+from ir_maniskill.environment.robots.robot import Robot, available_robots, find_robot
 from ir_maniskill.experiment import Experiment, ExperimentError
 from ir_maniskill.goals import COLORS, SHAPES
 from ir_maniskill.snapshot import Snapshot
@@ -75,8 +70,8 @@ class TouchEnv(RenderedEnv):
 
         Args:
             experiment: The experiment or its id.
-            robot_uids: Which robot: a subclass of `Robot`, or the uid of a registered
-                one.
+            robot_uids: Which robot: "nao", "g1", "panda", the uid of another that is
+                registered, or a subclass of `Robot`.
             render_backend: As for `BaseEnv`; "auto" is a CUDA device where there is
                 one and else whatever Vulkan finds, software included.
             reward_weights: Changes of `RewardWeights`, for the dense reward modes.
@@ -85,7 +80,8 @@ class TouchEnv(RenderedEnv):
 
         Raises:
             UnknownExperimentError: There is no experiment of that id.
-            ExperimentError: It is no experiment, or its goals don't fit the robot.
+            ExperimentError: It is no experiment, or its goals or places don't fit
+                the robot.
             RobotError: The robot cannot be used.
             ValueError: Several envs are asked for, but physics is on the CPU.
             RuntimeError: No Vulkan device can render here; says what to install.
@@ -99,7 +95,7 @@ class TouchEnv(RenderedEnv):
             )
         self.experiment = experiment
         _require_one_on_cpu(kwargs)
-        require_robot(robot_uids)
+        robot_uids = find_robot(robot_uids)
         # ManiSkill warns of robots that are not in here; ours are not the only ones.
         self.SUPPORTED_ROBOTS = (*available_robots(), robot_uids)
         self._reward_weights = replace(RewardWeights(), **(reward_weights or {}))
@@ -125,24 +121,23 @@ class TouchEnv(RenderedEnv):
 
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
-        return table_scene.policy_cameras()
+        return table_scene.policy_cameras(self.agent.scale)
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
-        return table_scene.video_camera()
-
-    def _load_agent(self, options: dict) -> None:
-        super()._load_agent(options, sapien.Pose())
+        return table_scene.video_camera(self.agent.scale)
 
     def _load_scene(self, options: dict) -> None:
-        table_scene.build_room(self.scene)
+        self.agent.require_reach(self.experiment)
+        table_scene.build_room(self.scene, self.agent)
         self.objects = [
-            table_scene.build_object(self.scene, thing)
+            table_scene.build_object(self.scene, thing, self.agent.scale)
             for thing in self.experiment.objects
         ]
 
     def _load_lighting(self, options: dict) -> None:
-        table_scene.add_lights(self.scene, shadow=self.enable_shadow)
+        scale = self.agent.scale
+        table_scene.add_lights(self.scene, scale, shadow=self.enable_shadow)
 
     def _after_reconfigure(self, options: dict) -> None:
         things, count, device = self.experiment.objects, self.num_envs, self.device
@@ -154,8 +149,8 @@ class TouchEnv(RenderedEnv):
         self._touch = self.agent.touch_sensor(self.objects)
         self._weights = self._reward_weights.vector().to(device)
         heights = [table_scene.OBJECT_HEIGHT[thing.shape] for thing in things]
-        self._places = np.array([thing.position for thing in things])  # [C, 2] [m]
-        self._object_z = table_scene.TABLE_TOP + np.array(heights) / 2  # [C] [m]
+        self._places = np.array([thing.position for thing in things])  # [C, 2], NAO's
+        self._object_z = table_scene.TABLE_TOP + np.array(heights) / 2  # [C], NAO's
         kinds = [(list(COLORS).index(o.color), SHAPES.index(o.shape)) for o in things]
         color_and_shape = torch.tensor(kinds, device=device).T
         self._color, self._shape = color_and_shape[:, None].repeat(1, count, 1)
@@ -164,6 +159,8 @@ class TouchEnv(RenderedEnv):
         self._success_once = torch.zeros(count, dtype=torch.bool, device=device)
         self._wrong_once = torch.zeros_like(self._success_once)
         self._start = torch.zeros(count, len(things), 7, device=device)
+        # What a pose is divided by to be one at NAO's scale.
+        self._size = torch.tensor([self.agent.scale] * 3 + [1.0] * 4, device=device)
 
     # -- Episode ---------------------------------------------------------------------
 
@@ -176,6 +173,7 @@ class TouchEnv(RenderedEnv):
         self._choose_instruction(env_idx, pick[:, 0], options.get("instruction"))
         self._place_objects(env_idx, order, 2 * place - 1, 2 * yaw - 1)
         jitter = self._tensor(2 * joint - 1) * self.experiment.jitter.joints
+        jitter = jitter * self.agent.jitter_unit
         qpos = self.agent.clamp_qpos(self.agent.start_qpos + jitter)
         self.agent.robot.set_qpos(qpos)
         # The last step's info, which others may keep, holds these very tensors.
@@ -229,7 +227,8 @@ class TouchEnv(RenderedEnv):
         xy = np.broadcast_to(self._places[seat], (batch, count, 2))
         xy = xy + jitter.position * place.reshape(batch, count, 2)
         z = np.broadcast_to(self._object_z, (batch, count))
-        position = self._tensor(np.concatenate([xy, z[..., None]], axis=-1))
+        place = np.concatenate([xy, z[..., None]], axis=-1)
+        position = self._tensor(self.agent.scale * place)  # [b, C, 3] [m]
         rotation = self._tensor(table_scene.yaw_quaternion(jitter.yaw * yaw))
         self._start = self._start.clone()
         self._start[env_idx] = torch.cat([position, rotation], dim=-1)
@@ -309,10 +308,10 @@ class TouchEnv(RenderedEnv):
         """
         return Snapshot(
             contact=self._touch.read(),
-            fingertip=self.agent.finger_position(),
-            pose=poses(self.objects),
-            start=self._start,
-            velocity=velocities(self.objects),
+            fingertip=self.agent.finger_position() / self.agent.scale,
+            pose=poses(self.objects) / self._size,
+            start=self._start / self._size,
+            velocity=velocities(self.objects) / self.agent.scale,
             color=self._color,
             shape=self._shape,
             stage=self._stage,

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import errno
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cache
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,12 @@ import imageio.v2 as imageio
 import imageio_ffmpeg
 import numpy as np
 import torch
-from mani_skill.utils.sapien_utils import look_at
 from matplotlib import font_manager
 from PIL import Image, ImageDraw, ImageFont
 
+from ir_maniskill.environment.robots.robot import Robot
 from ir_maniskill.environment.state import CAMERAS, StateStack
+from ir_maniskill.environment.table_scene import view
 from ir_maniskill.environment.touch_env import CONTROL_FREQ
 from ir_maniskill.evaluation.evaluate import Policy, choose_instructions, one_thread
 from ir_maniskill.files import replacing
@@ -59,7 +61,7 @@ RIGHT: Color = (64, 210, 128)
 WRONG: Color = (242, 84, 84)
 
 VIEWPOINT = ((0.80, 0.30, 0.40), (0.08, 0.0, 0.09))
-"""Eye and target of the human view [m]."""
+"""Eye and target of the human view, at NAO's scale [m]."""
 SHARPNESS = 1.5
 """How much larger the human view is rendered than shown, for smooth edges."""
 
@@ -74,8 +76,8 @@ class Snapshot:
     """The policy's pictures, top and front, each [h, w, 3] uint8."""
     instruction: str
     """The sentence."""
-    fingers: tuple[str, ...]
-    """Names of the robot's F fingers."""
+    hands: Mapping[str, tuple[str, ...]]
+    """Names of the robot's hands, and of the fingers of each, F in all."""
     right: tuple[bool, ...]
     """Which of the F fingers touch as the sentence asks."""
     wrong: tuple[bool, ...]
@@ -117,7 +119,7 @@ def record(
     with closing(gym.make(env_id, num_envs=1, **(env_kwargs or {}))) as env:
         base: Any = env.unwrapped
         told = choose_instructions(base.experiment.sentences, instructions)
-        with closing(_Stage(env_id, base.robot_uids)) as stage:
+        with closing(_Stage(env_id, base.agent)) as stage:
             for episode in range(episodes):
                 options = {"instruction": told[episode % len(told)]}
                 obs, _ = env.reset(seed=seed + episode, options=options)
@@ -131,17 +133,17 @@ class _Stage:
     what it sees.
     """
 
-    def __init__(self, env_id: str, robot: Any) -> None:
+    def __init__(self, env_id: str, robot: Robot) -> None:
         camera = {
             "width": round(VIEW[2] * SHARPNESS),
             "height": round(VIEW[3] * SHARPNESS),
-            "pose": look_at(*VIEWPOINT),
+            "pose": view(robot.scale, *VIEWPOINT),
             "fov": 0.58,
         }
         self._env = gym.make(
             env_id,
             num_envs=1,
-            robot_uids=robot,
+            robot_uids=type(robot),
             obs_mode="none",
             render_mode="rgb_array",
             enable_shadow=True,
@@ -174,7 +176,7 @@ def _play(
             view=stage.show(base.get_state_dict()),
             cameras=_camera_pictures(obs),
             instruction=base.get_language_instruction()[0],
-            fingers=base.agent.fingers,
+            hands=base.agent.hands,
             right=tuple(right),
             wrong=tuple(wrong),
             step=step,
@@ -321,27 +323,24 @@ def _draw_hands(page: Image.Image, snapshot: Snapshot) -> None:
     """Draw a row of lights for each hand, in the order of the robot's fingers."""
     x, y, _, _ = HANDS
     canvas = ImageDraw.Draw(page)
-    hands: dict[str, list[tuple[str, Color]]] = {}
-    touches = zip(snapshot.fingers, snapshot.right, snapshot.wrong, strict=True)
-    for finger, right, wrong in touches:
-        hand, name = _titles(finger)
-        color = WRONG if wrong else RIGHT if right else EDGE
-        hands.setdefault(hand, []).append((name, color))
-    for row, (hand, lights) in enumerate(hands.items()):
+    hands = snapshot.hands
+    touches = zip(snapshot.right, snapshot.wrong, strict=True)
+    for row, (hand, fingers) in enumerate(hands.items()):
         top = y + 14 + row * min(56, 112 // len(hands))
-        canvas.text((x + 18, top + 14), hand, FAINT, _font(13))
-        for column, (name, color) in enumerate(lights):
-            left = x + 84 + column * min(88, 218 // max(len(lights) - 1, 1))
+        canvas.text((x + 18, top + 14), hand.upper(), FAINT, _font(13))
+        for column, name in enumerate(_titles(fingers)):
+            right, wrong = next(touches)
+            color = WRONG if wrong else RIGHT if right else EDGE
+            left = x + 84 + column * min(88, 218 // max(len(fingers) - 1, 1))
             _draw_light(page, (left, top), name, color)
 
 
-def _titles(finger: str) -> tuple[str, str]:
-    """Split "LFinger1" into "LEFT" and "Finger 1"; other names have no hand."""
-    parts = re.fullmatch(r"([LR])([A-Z][a-z]+)(\d*)", finger)
-    if parts is None:
-        return "", finger
-    side, name, number = parts.groups()
-    return {"L": "LEFT", "R": "RIGHT"}[side], f"{name} {number}".strip()
+def _titles(fingers: tuple[str, ...]) -> list[str]:
+    """Return names without what all have in front, "LFinger1" as "Finger 1"."""
+    letters = zip(*fingers, strict=False)
+    same = list(takewhile(lambda column: len(set(column)) == 1, letters))
+    front = len(same) if len(fingers) > 1 else 0
+    return [re.sub(r"(?<=[a-z])(?=[A-Z\d])", " ", name[front:]) for name in fingers]
 
 
 def _draw_light(

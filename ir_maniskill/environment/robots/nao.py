@@ -34,9 +34,20 @@ JOINTS = tuple(side + joint for side in "LR" for joint in ARM_JOINTS + FINGER_JO
 
 # -- Fingers: the order of the tactile bits ----------------------------------------
 
-FINGERS = ("LFinger1", "LFinger2", "LThumb", "RFinger1", "RFinger2", "RThumb")
-"""The six fingers in the order of the tactile bits."""
-HANDS = {"left": FINGERS[:3], "right": FINGERS[3:]}
+HANDS = {
+    "left": ("LFinger1", "LFinger2", "LThumb"),
+    "right": ("RFinger1", "RFinger2", "RThumb"),
+}
+"""The hands and their fingers, in the order of the tactile bits."""
+FINGERTIPS = {
+    "LFinger1": "LFinger13_link",
+    "LFinger2": "LFinger23_link",
+    "LThumb": "LThumb2_link",
+    "RFinger1": "RFinger13_link",
+    "RFinger2": "RFinger23_link",
+    "RThumb": "RThumb2_link",
+}
+"""The last link of each finger."""
 
 # -- Actuation -----------------------------------------------------------------------
 
@@ -72,6 +83,13 @@ TORSO_BIT = {"L": 2, "R": 3}
 and hands do collide with it and with the other arm."""
 UPPER_ARM = ("Shoulder", "Bicep", "Elbow")
 
+# -- Reach ---------------------------------------------------------------------------
+
+SHOULDERS = ((0.0, 0.098), (0.0, -0.098))
+"""Where the arms start, seen from above (x, y) [m]."""
+REACH = 0.255
+"""Farthest that an object's center may be from a shoulder, seen from above [m]."""
+
 # -- The robot -----------------------------------------------------------------------
 
 OUR_URDF = str(URDF_PATH)
@@ -91,9 +109,11 @@ class Nao(Robot):
     uid = "nao"
     urdf_path = OUR_URDF
     joints = JOINTS
-    fingers = FINGERS
     hands = HANDS
+    fingertips = FINGERTIPS
     postures = POSTURES
+    shoulders = SHOULDERS
+    reach = REACH
 
     def drive(self, joint: str) -> JointGroup:
         """Return how a joint is driven: as one of the hand or of the arm."""
@@ -112,19 +132,12 @@ class Nao(Robot):
             super()._load_articulation(initial_pose)
         self.urdf_path = str(given)
 
-    def _after_loading_articulation(self) -> None:
-        super()._after_loading_articulation()
-        for link in self.robot.links:
-            for bit in _collision_bits(link.name):
-                link.set_collision_group_bit(group=2, bit_idx=bit, bit=1)
-
-
-def _collision_bits(link: str) -> tuple[int, ...]:
-    """Return the bits of a link; links that share one never collide."""
-    if link == "torso":
-        return tuple(TORSO_BIT.values())
-    side = link[0].upper()
-    if side not in ARM_BIT:
-        return ()
-    upper = link[1:] in UPPER_ARM
-    return (ARM_BIT[side], TORSO_BIT[side]) if upper else (ARM_BIT[side],)
+    def collision_bits(self, link: str) -> tuple[int, ...]:
+        """Return the bits of a link; links that share one never collide."""
+        if link == "torso":
+            return tuple(TORSO_BIT.values())
+        side = link[0].upper()
+        if side not in ARM_BIT:
+            return ()
+        upper = link[1:] in UPPER_ARM
+        return (ARM_BIT[side], TORSO_BIT[side]) if upper else (ARM_BIT[side],)

@@ -1,7 +1,7 @@
 """Robot: what the tasks ask of any robot, and how its joints are driven.
 
-A robot of your own is a subclass of `Robot` that names its file, joints, fingers and
-drives, in a file like `nao.py`; tasks take it as `gym.make(ID, robot_uids=...)`.
+A robot of your own is a subclass of `Robot` that describes it, in a file like `nao.py`;
+tasks take it as `gym.make(ID, robot_uids=...)`.
 Legend: N envs, J joints, F fingers, C objects.
 """
 
@@ -11,32 +11,31 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 import sapien
 import torch
 from mani_skill.agents.base_agent import BaseAgent, Keyframe
-from mani_skill.agents.controllers import (
-    PDJointPosController,
-    PDJointPosControllerConfig,
-)
 from mani_skill.agents.registration import REGISTERED_AGENTS
-from mani_skill.utils.structs import Actor, Link
+from mani_skill.utils.structs import Actor
 from torch import Tensor
 
 from ir_maniskill.environment import contacts
 from ir_maniskill.environment.bodies import positions
-
-
-class RobotError(ValueError):
-    """A robot cannot be used: says what was got, what was expected, what to do."""
+from ir_maniskill.environment.robots.controller import TargetControllerConfig
+from ir_maniskill.environment.robots.description import (
+    RobotError,
+    read_builder,
+    read_motors,
+)
+from ir_maniskill.experiment import Experiment, ExperimentError
 
 
 @dataclass(frozen=True)
 class JointGroup:
-    """Drive of one kind of joint."""
+    """Drive of one kind of joint; of a slide, read N for N m and m for rad."""
 
     stiffness: float
     """Proportional gain [N m / rad]."""
@@ -46,178 +45,173 @@ class JointGroup:
     """Rotor inertia seen by the joint; without it light fingers explode [kg m^2]."""
     delta: float
     """Largest change of the target in one step [half the joint's range]."""
-
-
-class TargetController(PDJointPosController):
-    """Joint position targets, kept within the limits, absolute or changed by a delta.
-
-    Differs from its parent in three ways: a delta never winds the target up beyond a
-    joint's limit, all that an action needs is computed once, where it can be, and a
-    reset of the env leaves the targets of other envs, and those of a restored state.
-    """
-
-    config: PDJointPosControllerConfig
-    _stale: Tensor | None = None
-    """While the env is being reset: whose targets `reset` is to set anew [N] bool."""
-
-    def _initialize_joints(self) -> None:
-        super()._initialize_joints()
-        limits = self.articulation.get_qlimits()[0, self.active_joint_indices]
-        self.lower, self.upper = limits.unbind(-1)  # [J] [rad]
-        self._physx_joints = [joint._objs[0] for joint in self.joints]
-
-    def _clip_and_scale_action_space(self) -> None:
-        super()._clip_and_scale_action_space()
-        low, high = self.action_space_low, self.action_space_high  # [J] [rad]
-        self._action_middle, self._action_scale = 0.5 * (high + low), 0.5 * (high - low)
-
-    def _clip_and_scale_action(self, action: Tensor) -> Tensor:
-        return self._action_middle + self._action_scale * action.clamp(-1, 1)
-
-    @property
-    def target(self) -> Tensor:
-        """Current joint position targets [N, J] [rad]."""
-        return self._target_qpos
-
-    def set_action(self, action: Tensor) -> None:
-        """Set the targets, or change them if the config says `use_delta`.
-
-        Args:
-            action: In the order of `config.joint_names` [N, J] in [-1, 1].
-        """
-        angle = self._preprocess_action(action)
-        self.set_drive_targets(self.target + angle if self.config.use_delta else angle)
-
-    def set_drive_targets(self, targets: Tensor) -> None:
-        """Send targets to the simulator.
-
-        Args:
-            targets: Positions in the order of `config.joint_names` [N, J] [rad].
-
-        Raises:
-            ValueError: They hold NaN (checked on the CPU only).
-        """
-        targets = targets.clamp(self.lower, self.upper)
-        if self.scene.gpu_sim_enabled:
-            # Of a batch ManiSkill takes the rows of the envs being reset alone.
-            super().set_drive_targets(targets[self.scene._reset_mask])
-        else:
-            angles = targets.tolist()[0]
-            if math.isnan(sum(angles)):
-                raise ValueError(
-                    f"joint targets: got {angles}, expected no NaN: look at the action"
-                )
-            for joint, angle in zip(self._physx_joints, angles, strict=True):
-                joint.set_drive_target(angle)
-        self._target_qpos = targets
-
-    def begin_reset(self) -> None:
-        """Take note of the envs being reset, which ManiSkill forgets before `reset`."""
-        self._stale = self.scene._reset_mask.clone()
-
-    def reset(self) -> None:
-        """Make the current positions the targets.
-
-        Within a reset of the env: of the envs being reset, unless `set_state` has
-        restored their targets since.
-        """
-        everyone = self.scene._reset_mask
-        if self._stale is not None:
-            self.scene._reset_mask, self._stale = self._stale, None
-        super().reset()
-        self.scene._reset_mask = everyone
-        self.set_drive_targets(self._target_qpos)
-
-    def get_state(self) -> dict[str, Tensor]:
-        """Return the targets, which are state in every mode."""
-        return {"target_qpos": self._target_qpos.clone()}
-
-    def set_state(self, state: dict[str, Tensor]) -> None:
-        """Restore what `get_state` returned."""
-        self.set_drive_targets(state["target_qpos"])
-        if self._stale is not None:
-            self._stale = torch.zeros_like(self._stale)
-
-
-@dataclass
-class TargetControllerConfig(PDJointPosControllerConfig):
-    """Config of `TargetController`; the fields are its parent's."""
-
-    controller_cls = TargetController
+    speed: float = math.inf
+    """Largest speed, where the file allows more [rad/s]."""
 
 
 class Robot(BaseAgent, ABC):
-    """A robot for the tasks, its root fixed at the origin behind the table.
+    """A robot for the tasks, its root fixed behind the table.
 
-    A subclass sets `uid` and `urdf_path`, which are ManiSkill's, and what follows. Its
-    joints need position, effort and velocity limits in the URDF.
+    A subclass sets `uid` and `urdf_path`, which are ManiSkill's, and what follows. The
+    world has x forward, y left, z up, and the objects' places are `scale` times those
+    of the experiment.
     """
 
     joints: tuple[str, ...]
-    """The actuated joints in the order of the action."""
-    fingers: tuple[str, ...]
-    """What feels touch, in the order of the tactile bits: the links of a finger are
-    those whose names start with its name."""
+    """The actuated joints in the order of the action, revolute or prismatic, each with
+    its limits in the file. Other joints are held where the first posture has them, or
+    at 0; a joint that mimics another is driven on its own if it is named here."""
+    hands: Mapping[str, tuple[str, ...]]
+    """Names of the hands, and the fingers of each: what feels touch."""
+    fingertips: Mapping[str, str]
+    """The link of each finger that is to reach an object."""
+    phalanges: Mapping[str, tuple[str, ...]] = {}
+    """The links by which a finger feels. Of a finger that is left out, they are those
+    whose names start with its name."""
     postures: Mapping[str, Mapping[str, float]]
     """Keyframes: angles of joints by name; those not named are at the middle [rad]. The
     first is the start of every episode, before jitter."""
+    mount: sapien.Pose = sapien.Pose()
+    """Where the root link stands in the world."""
+    stand: float = 0.0
+    """Width of the pillar under the root link, 0 if there are feet [m]."""
+    rebound: float = math.inf
+    """Fastest that a link is pushed out of what it got into; a strong arm with light
+    fingers explodes without a limit [m/s]."""
+    scale: float = 1.0
+    """How large table, objects, layout and cameras are, beside NAO's."""
+    shoulders: tuple[tuple[float, float], ...]
+    """Where the arms start in the world, seen from above (x, y) [m]."""
+    reach: float
+    """Farthest that an object may be from a shoulder, seen from above [m]."""
     start_qpos: Tensor
     """Start of every episode, in the simulator's order [J] [rad]."""
+    jitter_unit: Tensor
+    """What a jitter of 1 rad is to each joint, in the simulator's order [J]: 1, and of
+    a slide as much of its range as a radian is of half a turn [m]."""
 
     @abstractmethod
     def drive(self, joint: str) -> JointGroup:
         """Return how a joint is driven."""
 
+    def collision_bits(self, link: str) -> tuple[int, ...]:
+        """Return the bits (0 to 31) of a link; links that share one never collide."""
+        return ()
+
+    @property
+    def fingers(self) -> tuple[str, ...]:
+        """The fingers of all hands, in the order of the tactile bits."""
+        return tuple(finger for hand in self.hands.values() for finger in hand)
+
+    @classmethod
+    def require_reach(cls, experiment: Experiment) -> None:
+        """Raise unless the robot can reach whatever an experiment lays out.
+
+        Raises:
+            ExperimentError: An object may lie too far from every shoulder.
+        """
+        slack = experiment.jitter.position * math.sqrt(2)
+        for thing in experiment.objects:
+            place = [cls.scale * value for value in thing.position]
+            far = min(math.dist(place, shoulder) for shoulder in cls.shoulders)
+            if (far := far + cls.scale * slack) > cls.reach + 1e-9:
+                raise ExperimentError(
+                    f"{thing.name} at {thing.position}: {far:.3f} m from the nearest "
+                    f"shoulder of the robot {cls.uid!r} with jitter, at its scale of "
+                    f"{cls.scale:g}, expected at most {cls.reach} m"
+                )
+
     # -- Loading ---------------------------------------------------------------------
 
     def _load_articulation(self, initial_pose: Any = None) -> None:
-        super()._load_articulation(initial_pose)
-        self._effort, self._speed = _actuator_limits(self.urdf_path)
+        path = str(self.urdf_path)
+        self._motors = read_motors(Path(path), self.joints)
+        held = next(iter(self.postures.values()))
+        builder = read_builder(self.scene, path, self.joints, held, self.urdf_config)
+        builder.set_name(self.uid)
+        builder.initial_pose = self.mount
+        self.robot = builder.build()
+        self.robot_link_names = [link.name for link in self.robot.links]
+        self._shapes = {b.name: len(b.collision_records) for b in builder.link_builders}
+
+    def _require_shapes(self) -> None:
+        """Raise unless all collision shapes were made: SAPIEN says nothing if not."""
+        links = self.robot.links_map
+        made = {n: len(links[n]._bodies[0].collision_shapes) for n in self._shapes}
+        broken = [name for name, count in self._shapes.items() if made[name] < count]
+        if broken:
+            raise RobotError(
+                f"{self.urdf_path}: links with a collision shape that cannot be made: "
+                f"{', '.join(broken)}; expected meshes with a volume"
+            )
+        for finger in self.fingers:
+            names = self._phalanges_of(finger)
+            if not any(made[name] for name in names):
+                raise RobotError(
+                    f"{self.urdf_path}: finger {finger!r} of the robot {self.uid!r}: "
+                    f"no collision shape in {', '.join(names)}, so it feels nothing"
+                )
 
     def _after_loading_articulation(self) -> None:
-        self._require_joints()
-        for name in self.joints:
+        self._require_shapes()
+        for name, motor in self._motors.items():
+            drive = self.drive(name)
             for joint in self.robot.joints_map[name]._objs:
-                joint.set_armature([[self.drive(name).armature]])
-                joint.set_max_velocity(self._speed[name])
-
-    def _require_joints(self) -> None:
-        """Raise unless the actuated joints are those that move and have limits."""
-        got = {joint.name for joint in self.robot.active_joints} & self._effort.keys()
-        wrong = sorted(got.symmetric_difference(self.joints))
-        if wrong:
-            raise RobotError(
-                f"joints of the robot {self.uid!r}: its class and {self.urdf_path} "
-                f"differ in {', '.join(wrong)}; expected `joints` to name all that "
-                "move, each with a limit of position, effort and velocity in the file"
-            )
+                joint.set_armature([[drive.armature]])
+                joint.set_max_velocity(min(motor.velocity, drive.speed))
+        for link in self.robot.links:
+            for body in link._bodies if self.rebound < math.inf else ():
+                body.set_max_depenetration_velocity(self.rebound)
+            for bit in self.collision_bits(link.name):
+                link.set_collision_group_bit(group=2, bit_idx=bit, bit=1)
 
     def _after_init(self) -> None:
-        self.finger_links = tuple(self._links_of(finger) for finger in self.fingers)
+        links = self.robot.links_map
+        self.finger_links = tuple(
+            tuple(links[name] for name in self._phalanges_of(finger))
+            for finger in self.fingers
+        )
+        self.fingertip_links = tuple(links[self._tip_of(f)] for f in self.fingers)
         controller = self.controller
         self._order = controller.active_joint_indices  # [J] action order -> qpos
         self._middle = (controller.lower + controller.upper) / 2  # [J] [rad]
         self._half_range = (controller.upper - controller.lower) / 2  # [J] [rad]
+        slides = torch.tensor([self._motors[name].slides for name in self.joints])
+        unit = self._half_range / (math.pi / 2)
+        unit = unit.where(slides.to(self.device), 1.0)
+        self.jitter_unit = self.to_qpos(unit)
         self.keyframes = {
             name: self._keyframe(angles) for name, angles in self.postures.items()
         }
         start = next(iter(self.keyframes.values())).qpos
         self.start_qpos = torch.as_tensor(start, device=self.device)
 
-    def _links_of(self, finger: str) -> tuple[Link, ...]:
-        names = [n for n in self.robot.links_map if n.startswith(finger)]
-        if not names:
+    def _phalanges_of(self, finger: str) -> tuple[str, ...]:
+        """Return the names of a finger's links."""
+        links = list(self.robot.links_map)
+        mine = sorted(name for name in links if name.startswith(finger))
+        return self._require_links(finger, self.phalanges.get(finger, tuple(mine)))
+
+    def _tip_of(self, finger: str) -> str:
+        tip = self.fingertips.get(finger)
+        return self._require_links(finger, () if tip is None else (tip,))[0]
+
+    def _require_links(self, finger: str, names: tuple[str, ...]) -> tuple[str, ...]:
+        """Return names of links of a finger if there are any and the robot has them."""
+        available = self.robot.links_map
+        if not names or not set(names) <= available.keys():
             raise RobotError(
-                f"finger {finger!r} of the robot {self.uid!r}: no link has a name that "
-                f"starts so, available: {', '.join(self.robot.links_map)}"
+                f"finger {finger!r} of the robot {self.uid!r}: got the links "
+                f"{names}, expected `fingertips` to name its last one, and `phalanges` "
+                f"those that feel, available: {', '.join(available)}"
             )
-        return tuple(self.robot.links_map[n] for n in sorted(names))
+        return names
 
     def _keyframe(self, angles: Mapping[str, float]) -> Keyframe:
         position = self._middle.clone()
         for index, name in enumerate(self.joints):
             position[index] = angles.get(name, position[index])
-        return Keyframe(pose=sapien.Pose(), qpos=self.to_qpos(position).cpu().numpy())
+        return Keyframe(pose=self.mount, qpos=self.to_qpos(position).cpu().numpy())
 
     # -- Control ---------------------------------------------------------------------
 
@@ -239,7 +233,7 @@ class Robot(BaseAgent, ABC):
             "joint_names": list(self.joints),
             "stiffness": [g.stiffness for g in groups],
             "damping": [g.damping for g in groups],
-            "force_limit": [self._effort[name] for name in self.joints],
+            "force_limit": [self._motors[name].effort for name in self.joints],
         }
         return {
             "pd_joint_pos": TargetControllerConfig(lower=None, upper=None, **drive),
@@ -303,8 +297,8 @@ class Robot(BaseAgent, ABC):
         return self._ordered(self.robot.get_qvel())
 
     def finger_position(self) -> Tensor:
-        """Return where the last link of each finger is [N, F, 3] [m]."""
-        return positions([links[-1] for links in self.finger_links])
+        """Return where the fingertips' links are [N, F, 3] [m]."""
+        return positions(self.fingertip_links)
 
     def _ordered(self, joints: Tensor) -> Tensor:
         """Reorder [N, J] from the simulator's order to the action's."""
@@ -314,32 +308,38 @@ class Robot(BaseAgent, ABC):
         return ((position - self._middle) / self._half_range).clamp(-1, 1)
 
 
-def available_robots() -> tuple[str, ...]:
-    """Return the uids of the registered robots that the tasks can use."""
+def available_robots() -> dict[str, type[Robot]]:
+    """Return the registered robots that the tasks can use, by uid."""
     agents = {uid: spec.agent_cls for uid, spec in REGISTERED_AGENTS.items()}
-    return tuple(uid for uid, cls in agents.items() if issubclass(cls, Robot))
+    return {uid: cls for uid, cls in agents.items() if issubclass(cls, Robot)}
 
 
-def require_robot(robot: str | type[BaseAgent]) -> None:
-    """Raise unless the tasks can use a robot, given by uid or class.
+def find_robot(robot: str | type[BaseAgent]) -> str | type[Robot]:
+    """Return what ManiSkill is to be asked for: a registered uid, or a class.
+
+    Args:
+        robot: A subclass of `Robot`, the uid of a registered one, or its short name:
+            the uid of one of ours without `OURS`.
 
     Raises:
         RobotError: It is not registered, or not a `Robot`.
     """
-    known = isinstance(robot, type) and issubclass(robot, Robot)
-    if not known and robot not in available_robots():
-        raise RobotError(
-            f"robot_uids: got {robot!r}, expected a subclass of Robot or the uid of a "
-            f"registered one, available: {', '.join(available_robots())}"
-        )
+    if isinstance(robot, type) and issubclass(robot, Robot):
+        return robot
+    uids = available_robots()
+    for uid in uids:
+        if robot in (uid, short_name(uid)):
+            return uid
+    raise RobotError(
+        f"robot_uids: got {robot!r}, expected a subclass of Robot or the name of a "
+        f"registered one, available: {', '.join(map(short_name, uids))}"
+    )
 
 
-def _actuator_limits(urdf_path: str) -> tuple[dict[str, float], dict[str, float]]:
-    """Read effort [N m] and velocity [rad/s] limits, which SAPIEN's loader skips."""
-    effort, speed = {}, {}
-    for joint in ElementTree.parse(urdf_path).iter("joint"):
-        limit = joint.find("limit")
-        if limit is not None and {"effort", "velocity"} <= limit.attrib.keys():
-            effort[joint.attrib["name"]] = float(limit.attrib["effort"])
-            speed[joint.attrib["name"]] = float(limit.attrib["velocity"])
-    return effort, speed
+OURS = "ir_"
+"""Start of a uid that would else clash with one of ManiSkill's, such as "panda"."""
+
+
+def short_name(uid: str) -> str:
+    """Return what the tasks call the robot of that uid, such as "panda"."""
+    return uid.removeprefix(OURS)
