@@ -120,11 +120,9 @@ def test_the_sentence_its_tokens_and_its_object_belong_together(env: gym.Env) ->
         assert torch.equal(again["extra"]["instruction"], obs["extra"]["instruction"])
         words = [catalog.VOCABULARY[token] for token in obs["extra"]["instruction"][0]]
         assert words == instruction.text.lower().replace(".", " .").split()
-    for wrong in (3, True, 1.5, "Touch the sky.", [0.0], float):
-        with pytest.raises(ValueError, match="'instruction': got .* expected s"):
+    for wrong in (3, True, 1.5, "Touch the sky.", [0, 0], float):
+        with pytest.raises(ValueError, match="'instruction': got .* expected an index"):
             env.reset(options={"instruction": wrong})
-    with pytest.raises(ValueError, match=r"got \[0, 0\].* or one for each of 1: "):
-        env.reset(options={"instruction": [0, 0]})
 
 
 def test_an_episode_is_finite_and_ends_by_time_alone(env: gym.Env) -> None:

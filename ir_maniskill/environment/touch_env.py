@@ -21,6 +21,7 @@ from torch import Tensor
 from ir_maniskill import experiment as catalog
 from ir_maniskill.doctor import require_vulkan
 from ir_maniskill.environment import reward_generator, table_scene
+from ir_maniskill.environment.arguments import instruction_indices
 from ir_maniskill.environment.bodies import poses, velocities
 from ir_maniskill.environment.instructional_set import GoalBatch, InstructionalSet
 from ir_maniskill.environment.rendering import RenderedEnv
@@ -189,28 +190,9 @@ class TouchEnv(RenderedEnv):
     ) -> None:
         index = self.instructional_set.pick(self._tensor(uniform))
         if forced is not None:
-            index = self._index_of(forced, len(env_idx))
+            told = instruction_indices(forced, self.experiment.sentences, len(env_idx))
+            index = torch.tensor(told, device=self.device)
         self.instruction_index[env_idx] = index
-
-    def _index_of(self, forced: Any, count: int) -> Tensor:
-        """Return the indices of instructions given by index or by sentence."""
-        sentences = self.experiment.sentences
-        given = [forced] if isinstance(forced, str) else forced
-        if isinstance(given, list | tuple) and set(given) <= set(sentences):
-            given = [sentences.index(sentence) for sentence in given]
-        try:
-            index = torch.as_tensor(given, device=self.device)
-            whole = not (index.is_floating_point() or index.dtype == torch.bool)
-            in_range = whole and bool(((index >= 0) & (index < len(sentences))).all())
-        except (TypeError, ValueError, RuntimeError):
-            in_range = False
-        if not in_range or index.shape not in ((), (1,), (count,)):
-            raise ValueError(
-                f"reset option 'instruction': got {forced!r}, expected sentences or "
-                f"indices 0 to {len(sentences) - 1}, one for all envs or one for each "
-                f"of {count}: {sentences}"
-            )
-        return index
 
     def _resolve_goals(self) -> None:
         """Look up what the sentences of all envs refer to, as their episodes began."""
