@@ -34,8 +34,12 @@ from ir_maniskill.training.config import (
     RenderBackend,
     SimBackend,
     TrainConfig,
+    leaves,
+    require_same,
 )
-from ir_maniskill.training.train import train
+from ir_maniskill.training.run_folder import stored_config
+from ir_maniskill.training.train import for_experiment
+from ir_maniskill.training.train import run as train
 
 TaskId = Positional[Annotated[str, arg(metavar="ID")]]
 
@@ -64,10 +68,10 @@ class Train:
     """Train an agent."""
 
     config: Annotated[TrainOptions, arg(name="")]
-    preset: Literal["default", "posture", "paper"] = "default"
-    """Which numbers to start from: ours to touch, ours to hold, the paper's."""
+    preset: Literal["default", "vision", "paper"] = "default"
+    """Which numbers to start from: ours, ours for pictures alone, the paper's."""
     resume: bool = False
-    """Go on from the last checkpoint of the folder, if there is one."""
+    """Go on from the folder's last checkpoint, if there is one, with its own config."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -183,18 +187,34 @@ def _in_one_line(error: Exception) -> str:
 def parse(arguments: Sequence[str]) -> Any:
     """Return the command that the arguments ask for.
 
-    A preset gives the defaults of the other options of `train`, hence the look ahead.
+    A preset gives the defaults of the other options of `train`, hence the look ahead;
+    a run that is resumed gives them itself, once it is known which one it is.
     """
     ahead = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    ahead.add_argument("--preset", nargs="?", default="default")
+    ahead.add_argument("--preset", nargs="?")
     preset = ahead.parse_known_args(list(arguments))[0].preset
-    if preset not in CONFIGS:
+    if preset is not None and preset not in CONFIGS:
         raise UsageError(f"--preset: got {preset!r}, available: {', '.join(CONFIGS)}")
-    numbers = {f.name: getattr(CONFIGS[preset], f.name) for f in _TRAIN_FIELDS}
+    command = _parse(arguments, CONFIGS[preset or "default"])
+    if not isinstance(command, Train) or not command.resume:
+        return command
+    config = _config(command)
+    stored = stored_config(Path(config.out))
+    if stored is None:
+        return command
+    if preset is not None:  # it is given as much as single numbers are
+        given = for_experiment(config, catalog.get(config.env_id))
+        require_same(stored, leaves(given))
+    return _parse(arguments, stored)
+
+
+def _parse(arguments: Sequence[str], defaults: TrainConfig) -> Any:
+    """Return the command, with defaults for what `train` is not told."""
+    numbers = {f.name: getattr(defaults, f.name) for f in _TRAIN_FIELDS}
     options = TrainOptions(**{**numbers, "env_id": tyro.MISSING, "out": ""})
     commands = (
         Annotated[Tasks, subcommand("tasks")]
-        | Annotated[Train, subcommand("train", default=Train(options, preset))]
+        | Annotated[Train, subcommand("train", default=Train(options))]
         | Annotated[Evaluate, subcommand("evaluate")]
         | Annotated[Video, subcommand("video")]
         | Annotated[Curve, subcommand("curve")]
@@ -204,6 +224,14 @@ def parse(arguments: Sequence[str]) -> Any:
     return tyro.cli(
         commands, args=list(arguments), prog="ir-maniskill", description=_DESCRIPTION
     )
+
+
+def _config(command: Train) -> TrainConfig:
+    """Return the configuration that a train command asks for."""
+    options = command.config
+    numbers = {f.name: getattr(options, f.name) for f in _TRAIN_FIELDS}
+    numbers["out"] = options.out or f"runs/{catalog.get(options.env_id).id}"
+    return TrainConfig(**numbers)
 
 
 # -- Commands ------------------------------------------------------------------------
@@ -253,11 +281,7 @@ def _describe(experiment: Experiment) -> tuple[str, str, str, str, str]:
 
 
 def _train(command: Train) -> int:
-    options = command.config
-    numbers = {f.name: getattr(options, f.name) for f in _TRAIN_FIELDS}
-    config = TrainConfig(**numbers)
-    catalog.get(config.env_id)
-    config = dataclasses.replace(config, out=config.out or f"runs/{config.env_id}")
+    config = _config(command)
     with distributed.group():
         best = train(config, resume=command.resume)
         if distributed.rank() == 0:
@@ -274,6 +298,7 @@ def _evaluate(command: Evaluate) -> int:
     chosen = _find_instruction(task, command.instruction)
     path = _find_policy(task, command.checkpoint)
     agent, config, facts = _load(path, task, command.any_task)
+    agent.to(distributed.device())
     if command.json is not None:
         _require_writable(command.json)
     kwargs = config.env_kwargs(training=False)

@@ -16,7 +16,7 @@ if [ -f "$finished" ] && [ -f "$best" ]; then
 else
     echo "Training on $task from camera images (README.md says how long that takes)."
     echo "Ctrl-C is safe: the next 'make demo' goes on from the last checkpoint."
-    "$ir" train "$task" --out "$folder" --agent.senses vision --resume
+    "$ir" train "$task" --out "$folder" --preset vision --resume
 fi
 
 echo

@@ -19,7 +19,7 @@ import psutil
 import torch
 from toy_envs import LENGTH, ToyVectorEnv, toy_config
 
-from ir_maniskill.training import checkpoint
+from ir_maniskill.training import checkpoint, runner
 from ir_maniskill.training import train as training
 from ir_maniskill.training.config import PPOConfig
 
@@ -30,11 +30,12 @@ UPDATES = 90
 
 def train(folder):
     """Train in this process, from the folder's checkpoint if there is one."""
-    training.FINAL_EPISODES = 16
-    ppo = PPOConfig(rollouts=8, rollout_length=LENGTH, epochs=1, minibatch=None)
+    runner.FINAL_EPISODES = 16
+    ppo = PPOConfig(8 * LENGTH, epochs=1, minibatch=None)
     every = {"total_steps": UPDATES * UPDATE, "checkpoint_interval": UPDATE}
     config = toy_config(folder, ppo=ppo, eval_interval=20 * UPDATE, **every)
-    training.train(config, resume=True, envs=ToyVectorEnv(config.num_envs))
+    envs, evaluated_in = (ToyVectorEnv(config.num_envs) for _ in range(2))
+    training.train(config, resume=True, envs=envs, eval_envs=evaluated_in)
 
 
 def killed_at_any_time(folder, generator):

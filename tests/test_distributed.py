@@ -12,16 +12,16 @@ from pathlib import Path
 import pytest
 import torch
 from torch.nn.utils import parameters_to_vector
-from toy_envs import LENGTH, ToyVectorEnv, toy_config
+from toy_envs import LENGTH, SPEC, ToyVectorEnv, toy_config, toy_state
 
-from ir_maniskill.agent import Agent, StateSpec
-from ir_maniskill.environment.state import StateStack
-from ir_maniskill.training import checkpoint, distributed, ppo
+from ir_maniskill.agent import Agent
+from ir_maniskill.training import checkpoint, distributed, ppo, runner
 from ir_maniskill.training import train as training
 from ir_maniskill.training.config import ConfigError
 from ir_maniskill.training.distributed import RankError
-from ir_maniskill.training.rollout import EpisodeSums, RewardScale, Rollout, collect
+from ir_maniskill.training.rollout import RewardScale, Rollout
 from ir_maniskill.training.run_folder import RunFolder
+from ir_maniskill.training.runner import Runner, StepCounts
 
 ENVS = 8  # of all ranks together
 UPDATE = 32 * LENGTH  # steps of an update of the toy task
@@ -60,7 +60,7 @@ def as_rank(rank, ranks, port, ready, work, out):
     os.environ.update({name: str(number) for name, number in numbers.items()})
     os.environ["MASTER_ADDR"] = "127.0.0.1"
     torch.set_num_threads(1)
-    training.FINAL_EPISODES = 16
+    runner.FINAL_EPISODES = 16
     ready.wait()  # loading may take one of them longer than the patience under test
     work(out)
 
@@ -74,16 +74,17 @@ def load(out, ranks=2):
 
 def fixed_rollout():
     """Return an agent with all its parts, and what it lived through in all envs."""
-    config = toy_config("x")
-    agent_config = dataclasses.replace(config.agent, auxiliary_weight=0.5)
-    envs, stack = ToyVectorEnv(ENVS), StateStack(3)
-    state = stack.reset(envs.reset(seed=0)[0])
+    agent_config = dataclasses.replace(toy_config("x").agent, auxiliary_weight=0.5)
     torch.manual_seed(0)
-    agent = Agent(agent_config, StateSpec.of(state, 2))
-    rollout = Rollout(16, state, 2)
-    state, _ = collect(envs, stack, state, agent, rollout, config.ppo)
-    # What the ranks see shall differ, else per-rank statistics would do as well.
-    rollout.reward += 0.1 * torch.arange(ENVS)
+    agent, rollout = Agent(agent_config, SPEC), Rollout(16, toy_state(ENVS), 2)
+    never = torch.zeros(ENVS, dtype=torch.bool)
+    for t in range(16):
+        state = toy_state(ENVS)
+        with torch.no_grad():
+            rollout.add(t, state, agent.act(state))
+        # What the ranks see shall differ, else per-rank statistics would do as well.
+        reward = 0.1 * torch.rand(ENVS) + 0.05 * torch.arange(ENVS)
+        rollout.add_outcome(t, reward, never, torch.zeros(ENVS))
     rollout.state["privileged"] *= 1 + torch.arange(ENVS)[:, None]
     rollout.finish(torch.zeros(ENVS), 0.9, 0.95)
     return agent, rollout
@@ -120,12 +121,14 @@ def learn_from_the_fixed_rollout(out):
         epochs = {"epochs": 20, "max_kl": 1e-4, "target_kl": None}
         whole = dataclasses.replace(config, minibatch=None, **epochs)
         optimizer = torch.optim.SGD(agent.parameters(), 0.05)
-        got["figures"] = ppo.update(agent, optimizer, rollout, whole)
+        got["figures"] = ppo.improve(agent, optimizer, rollout, whole)
         got["weights"] = parameters_to_vector(agent.parameters()).detach()
-        ppo.update(agent, optimizer, rollout, dataclasses.replace(config, minibatch=48))
+        ppo.improve(
+            agent, optimizer, rollout, dataclasses.replace(config, minibatch=48)
+        )
         got["minibatches"] = parameters_to_vector(agent.parameters()).detach()
         number = distributed.rank() + 1
-        sums = EpisodeSums(steps=10 * number, episodes=number, reward=0.5, success=1)
+        sums = StepCounts(steps=10 * number, episodes=number, reward=0.5, success=1)
         got["sums"] = dataclasses.astuple(sums.over_ranks())
         torch.save(got, out / f"{distributed.rank()}.pt")
 
@@ -143,8 +146,8 @@ def learned(tmp_path_factory):
 def test_two_ranks_get_what_one_gets_from_the_joined_batch(learned, what):
     first, second, joined = (got[what] for got in learned)
     assert torch.equal(first, second)
-    assert (first - joined).abs().max() <= 1e-6 * max(1, float(joined.abs().max()))
-    assert joined.abs().max() > 1e-3
+    assert (first - joined).abs().max() <= 3e-6 * max(1, float(joined.abs().max()))
+    assert joined.abs().max() > 1e-4
 
 
 def test_rewards_are_scaled_by_the_returns_of_all_ranks(learned):
@@ -160,8 +163,8 @@ def test_the_ranks_stop_their_epochs_together(learned):
 
 
 def test_episodes_are_counted_over_all_ranks(learned):
-    first, second, _ = (EpisodeSums(*got["sums"]) for got in learned)
-    assert first == second == EpisodeSums(steps=30, episodes=3, reward=1.0, success=2)
+    first, second, _ = (StepCounts(*got["sums"]) for got in learned)
+    assert first == second == StepCounts(steps=30, episodes=3, reward=1.0, success=2)
     assert first.means()["success"] == 2 / 3
 
 
@@ -174,9 +177,15 @@ def test_minibatches_leave_the_ranks_with_the_same_weights(learned):
 # -- Training --------------------------------------------------------------------------
 
 
-def toy(out, **changes):
+def toy(out):
     """Return the config of a run of four updates, and this rank's envs."""
-    return toy_config(out, **changes), ToyVectorEnv(ENVS // distributed.size())
+    return toy_config(out), ToyVectorEnv(ENVS // distributed.size())
+
+
+def runner_of(config, envs):
+    """Return a runner of untrained agents."""
+    folder = distributed.from_first(lambda: RunFolder(Path(config.out), resume=False))
+    return Runner(config, folder, envs, lambda: ToyVectorEnv(4), ppo.PPO)
 
 
 def interrupt(envs, error):
@@ -193,20 +202,25 @@ def interrupt(envs, error):
     return envs
 
 
+def train(config, envs, **kwargs):
+    return training.train(config, envs=envs, eval_envs=ToyVectorEnv(4), **kwargs)
+
+
 def train_whole_and_in_halves(out):
     with distributed.group(timedelta(minutes=2)):
         config, envs = toy(out / "whole")
-        folder = distributed.from_first(lambda: RunFolder(out / "whole", resume=False))
-        trainer = training.Trainer(config, envs, folder)
-        got = {"scene": trainer.state["proprioception"]}
-        trainer.learn()
-        got |= {"action": trainer.rollout.action, "weights": trainer.agent.state_dict()}
+        made = runner_of(config, envs)
+        got = {"scene": made.state["proprioception"]}
+        made.learn()
+        made.folder.close()
+        learned = made.algorithm
+        got |= {"action": learned.rollout.action, "weights": learned.agent.state_dict()}
         torch.save(got, out / f"{distributed.rank()}.pt")
         config, envs = toy(out / "halves")
         with pytest.raises(KeyboardInterrupt):
-            training.train(config, envs=interrupt(envs, KeyboardInterrupt))
+            train(config, interrupt(envs, KeyboardInterrupt))
         torch.manual_seed(123)  # whatever happens in between
-        training.train(config, resume=True, envs=toy(out / "halves")[1])
+        train(*toy(out / "halves"), resume=True)
 
 
 @pytest.fixture(scope="module")
@@ -225,9 +239,7 @@ def test_ranks_end_with_the_same_weights_and_explore_apart(trained):
 
 
 def test_the_ranks_have_the_scenes_of_one_with_all_envs(trained, tmp_path):
-    config, envs = toy(tmp_path)
-    folder = RunFolder(tmp_path, resume=False)
-    scene = training.Trainer(config, envs, folder).state["proprioception"]
+    scene = runner_of(*toy(tmp_path)).state["proprioception"]
     assert torch.equal(torch.cat([got["scene"] for got in load(trained)]), scene)
 
 
@@ -260,9 +272,9 @@ def lose_the_other(out):
     with distributed.group(timedelta(minutes=2)):
         config, envs = toy(out)
         if distributed.rank() == 1:
-            training.train(config, envs=interrupt(envs, RuntimeError("broken")))
+            train(config, interrupt(envs, RuntimeError("broken")))
         with pytest.raises(RankError, match=r"rank 0 lost the others: one .* failed"):
-            training.train(config, envs=envs)
+            train(config, envs)
 
 
 def test_a_rank_that_fails_stops_the_others_with_their_work_saved(tmp_path):
@@ -280,6 +292,7 @@ def keep_the_other_waiting(out):
             distributed.gather(torch.zeros(1))
 
 
+@pytest.mark.slow
 def test_a_rank_that_hangs_does_not_keep_the_others_forever(tmp_path):
     assert in_ranks(keep_the_other_waiting, tmp_path) == [0, None]
 
@@ -289,7 +302,7 @@ def test_a_rank_that_hangs_does_not_keep_the_others_forever(tmp_path):
     [
         ({"num_envs": 8}, "num_envs: got 8, expected a multiple of 3"),
         (
-            {"num_envs": 12, "ppo": {"rollouts": 12, "minibatch": 2}},
+            {"num_envs": 12, "ppo": {"minibatch": 2}},
             "minibatch: got 2, expected at least 3",
         ),
     ],
@@ -319,7 +332,9 @@ def test_torchrun_trains_on_the_real_task(tmp_path):
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
     torchrun += ["--nproc-per-node", "2", "--no-python", str(command)]
     options = "--agent.senses state --agent.hidden 16 --agent.language-layers 1 "
-    options += "--num-envs 4 --ppo.rollouts 4 --ppo.minibatch 64 --ppo.epochs 1 "
+    options += (
+        "--num-envs 4 --ppo.steps-per-update 128 --ppo.minibatch 64 --ppo.epochs 1 "
+    )
     options += "--total-steps 256 --eval-episodes 1 --out"
     train = ["train", "NaoTouchCubeSingle-v1", *options.split(), str(tmp_path)]
     done = subprocess.run([*torchrun, *train], capture_output=True, text=True)

@@ -4,22 +4,18 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from toy_envs import GOALS, ToyVectorEnv, toy_config
+from toy_envs import SPEC, toy_config, toy_state
 
-from ir_maniskill.agent import Agent, StateSpec
+from ir_maniskill.agent import Agent
 from ir_maniskill.agent.agent import Act, Judgement
+from ir_maniskill.environment.reward_generator import TERMS, RewardWeights
 from ir_maniskill.environment.state import StateStack
 from ir_maniskill.training import ppo
-from ir_maniskill.training.config import PPOConfig
+from ir_maniskill.training.algorithm import Outcome
+from ir_maniskill.training.config import ConfigError, PPOConfig, TrainConfig
 from ir_maniskill.training.finite import TrainingDivergedError, check_finite
-from ir_maniskill.training.rollout import (
-    Batch,
-    EpisodeSums,
-    RewardScale,
-    Rollout,
-    advantages,
-    collect,
-)
+from ir_maniskill.training.rollout import Batch, RewardScale, Rollout, advantages
+from ir_maniskill.training.schedules import Curriculum, Linear
 
 
 def column(*values):
@@ -101,22 +97,105 @@ def test_each_image_is_stored_once():
     assert rollout.frames.images.shape[:2] == (10 + 2, 4)
 
 
-def test_collecting_bootstraps_only_where_time_ran_out():
-    envs, config = ToyVectorEnv(4), PPOConfig()
-    stack = StateStack(3)
-    state = stack.reset(envs.reset(seed=0)[0])
-    agent = Agent(toy_config("x").agent, StateSpec.of(state, 2))
-    rollout = Rollout(10, state, 2)
-    with torch.no_grad():
-        agent.critic.value[-1].weight.zero_()
-        agent.critic.value[-1].bias.fill_(5.0)
-    _, sums = collect(envs, stack, state, agent, rollout, config)
-    assert rollout.done.nonzero()[:, 0].unique().tolist() == [7]
-    assert torch.equal(rollout.next_value[7], torch.full((4,), 5.0))
-    assert (sums.steps, sums.episodes) == (40, 4)
-    state = stack.reset(envs.reset(seed=0)[0])
-    collect(envs, stack, state, agent, rollout, PPOConfig(bootstrap=False))
-    assert torch.equal(rollout.next_value[7], torch.zeros(4))
+# -- The algorithm ---------------------------------------------------------------------
+
+
+def toy_ppo(**changes):
+    """Return an algorithm for four envs whose roll-outs are two steps long."""
+    config = toy_config("x")
+    learner = replace(config.ppo, **{"steps_per_update": 8, "minibatch": 4} | changes)
+    return ppo.PPO(replace(config, ppo=learner, num_envs=4), toy_state(4), 2)
+
+
+def outcome(truncated=(False,) * 4, terminated=(False,) * 4, **changes):
+    """Return what a step led to in four envs."""
+    ends = {"truncated": truncated, "terminated": terminated}
+    values = {name: torch.tensor(value) for name, value in ends.items()}
+    values |= {"reward": torch.ones(4), "terms": None, "state": toy_state(4)}
+    return Outcome(**(values | {"final": None} | changes))
+
+
+def test_it_learns_when_its_roll_out_is_full_and_not_before():
+    algorithm = toy_ppo()
+    weights = {k: v.clone() for k, v in algorithm.agent.state_dict().items()}
+    for is_full in (False, True, False):
+        algorithm.act(toy_state(4))
+        algorithm.observe(outcome())
+        assert bool(algorithm.update()) == is_full
+    learned = algorithm.agent.state_dict()
+    assert not torch.equal(
+        learned["actor.mean.0.weight"], weights["actor.mean.0.weight"]
+    )
+
+
+def test_only_where_time_ran_out_the_last_state_has_a_value():
+    values = {}
+    for bootstrap in (True, False):
+        algorithm = toy_ppo(bootstrap=bootstrap)
+        with torch.no_grad():
+            algorithm.agent.critic.value[-1].weight.zero_()
+            algorithm.agent.critic.value[-1].bias.fill_(5.0)
+        algorithm.act(toy_state(4))
+        ends = {"truncated": (True, True, False, False)}
+        ends["terminated"] = (False, True, True, False)
+        algorithm.observe(outcome(**ends, final=toy_state(4)))
+        values[bootstrap] = algorithm.rollout.next_value[0].tolist()
+        assert algorithm.rollout.done[0].tolist() == [True, True, True, False]
+    assert values == {True: [5, 0, 0, 0], False: [0, 0, 0, 0]}
+
+
+def test_reward_terms_are_weighed_by_a_curriculum():
+    row = {"hold_after_foul": 2.0, "approach": 1.0, "foul": 1.0, "speed": 0.1}
+    terms = torch.tensor([[row.get(name, 0.0) for name in TERMS]] * 4)
+    config = replace(toy_config("x"), penalty_warmup=0.5, num_envs=4)
+    algorithm = ppo.PPO(config, toy_state(4), 2)
+    got = []
+    for share in (0.0, 0.25, 0.5, 1.0):
+        algorithm.share, algorithm._t = share, 0
+        algorithm.act(toy_state(4))
+        algorithm.observe(outcome(terms=terms))
+        got.append(float(algorithm.rollout.reward[0, 0]))
+    # hold 2 x (1, 0.625, 0.25, 0.25) + approach 0.5 - (foul 0.5 + speed 0.6) x part
+    assert got == pytest.approx([2.5, 1.75 - 0.55, 1.0 - 1.1, 1.0 - 1.1])
+
+
+def test_a_sparse_reward_is_learned_from_as_it_is():
+    algorithm = toy_ppo()
+    algorithm.act(toy_state(4))
+    algorithm.observe(outcome(reward=torch.tensor([0.0, 1.0, 2.0, -0.1])))
+    got = algorithm.rollout.reward[0].tolist()
+    assert got == pytest.approx([0.0, 1.0, 2.0, -0.1])
+
+
+def test_a_schedule_changes_between_two_shares_and_stays_outside():
+    schedule = Linear(2.0, 4.0, begin_share=0.25, end_share=0.75)
+    shares = (0.0, 0.25, 0.5, 0.75, 1.0)
+    assert [schedule(share) for share in shares] == [2, 2, 3, 4, 4]
+    assert Curriculum(RewardWeights(), warmup=0.0).at(0.0) == RewardWeights()
+    with pytest.raises(ConfigError, match=r"got \(0.5, 0.25\), expected 0 <= begin"):
+        Linear(0, 1, 0.5, 0.25)
+
+
+@pytest.mark.parametrize(("num_envs", "steps"), [(16, 128), (24, 86), (1024, 2)])
+def test_any_number_of_envs_shares_an_update(num_envs, steps):
+    assert TrainConfig(num_envs=num_envs).steps_per_env == steps
+
+
+def test_the_algorithm_goes_on_from_its_state():
+    torch.manual_seed(0)
+    first, other = toy_ppo(), toy_ppo()
+    for algorithm in (first, first):
+        for _ in range(2):
+            algorithm.act(toy_state(4))
+            algorithm.observe(outcome(reward=torch.rand(4)))
+        algorithm.update()
+    other.load_state_dict(first.state_dict())
+    again = other.state_dict()
+    for name, tensor in first.state_dict().items():
+        assert torch.equal(tensor, again[name]), name
+
+
+# -- Reward scale and losses -----------------------------------------------------------
 
 
 def test_rewards_are_scaled_by_the_deviation_of_discounted_returns():
@@ -140,7 +219,7 @@ def test_the_reward_scale_goes_on_after_a_restart():
     scale(first, done)
     scale.restart()
     other = RewardScale(2, 0.9)
-    other.load_state_dict(scale.state_dict())
+    other.load_state(scale.state())
     assert torch.equal(scale(first, done), other(first, done))
 
 
@@ -158,12 +237,6 @@ def batch_of(advantage, returns=(0.0, 0.0), **state):
     return Batch(state, torch.zeros(size, 1), torch.zeros(size), *rows)
 
 
-def test_where_no_episode_ended_there_are_no_figures_of_episodes():
-    means = EpisodeSums(steps=4, reward=2.0, touching=1).means()
-    assert (means["reward"], means["touching"]) == (0.5, 0.25)
-    assert all(math.isnan(means[name]) for name in ("return", "success", "exclusive"))
-
-
 def test_policy_loss_is_clipped_by_hand():
     agent = judged([math.log(1.5), math.log(0.5)], value=[0.0, 0.0])
     _, terms = ppo.ppo_loss(agent, batch_of([1.0, -1.0]), PPOConfig(clip=0.2))
@@ -172,16 +245,13 @@ def test_policy_loss_is_clipped_by_hand():
     assert float(terms["clipped"]) == 1.0
 
 
-def test_value_entropy_and_auxiliary_losses_by_hand():
+def test_value_and_auxiliary_losses_by_hand():
     agent = judged([0.0, 0.0], value=[1.0, 3.0], target=torch.full((2, 3), 0.15))
-    config = PPOConfig(value_weight=0.5, entropy_weight=0.1)
     place = {"named_position": torch.full((2, 3), 0.1)}
-    loss, terms = ppo.ppo_loss(
-        agent, batch_of([1.0, -1.0], (0.0, 0.0), **place), config
-    )
+    loss, terms = ppo.ppo_loss(agent, batch_of([1.0, -1.0], **place), PPOConfig())
     assert float(terms["value"]) == pytest.approx(2.5)
     assert float(terms["auxiliary"]) == pytest.approx(0.25)  # 0.5 dm off, squared
-    assert float(loss) == pytest.approx(0.5 * 2.5 - 0.1 * 1.0 + 2.0 * 0.25)
+    assert float(loss) == pytest.approx(0.5 * 2.5 + 2.0 * 0.25)
 
 
 def test_an_object_that_fell_far_does_not_outweigh_the_others():
@@ -201,21 +271,24 @@ def test_minibatches_cover_every_step_once():
     assert len(list(ppo.minibatches(rollout, PPOConfig(minibatch=None)))) == 1
 
 
-def collected(config):
-    envs, stack = ToyVectorEnv(8), StateStack(3)
-    state = stack.reset(envs.reset(seed=0)[0])
+def collected():
+    """Return an agent, its optimizer and a roll-out of random steps."""
     torch.manual_seed(0)
-    agent = Agent(config.agent, StateSpec.of(state, 2))
-    rollout = Rollout(16, state, 2)
-    state, _ = collect(envs, stack, state, agent, rollout, config.ppo)
+    agent = Agent(toy_config("x").agent, SPEC)
+    rollout = Rollout(16, toy_state(8), 2)
+    for t in range(16):
+        state = toy_state(8)
+        with torch.no_grad():
+            rollout.add(t, state, agent.act(state))
+        rollout.add_outcome(t, torch.rand(8), torch.zeros(8).bool(), torch.zeros(8))
     rollout.finish(torch.zeros(8), 0.9, 0.95)
     return agent, torch.optim.Adam(agent.parameters(), 0.01), rollout
 
 
 def test_epochs_stop_once_the_policy_moved_far_enough():
-    agent, optimizer, rollout = collected(toy_config("x"))
+    agent, optimizer, rollout = collected()
     eager = PPOConfig(epochs=20, minibatch=64, max_kl=1e-3)
-    assert ppo.update(agent, optimizer, rollout, eager)["epochs"] < 20
+    assert ppo.improve(agent, optimizer, rollout, eager)["epochs"] < 20
 
 
 @pytest.mark.parametrize(
@@ -249,7 +322,7 @@ def test_a_step_size_beyond_its_bounds_never_changes_the_wrong_way(kl, rate):
 
 
 def test_the_gradient_is_cut_to_its_longest_length():
-    agent, _, rollout = collected(toy_config("x"))
+    agent, _, rollout = collected()
     loss, _ = ppo.ppo_loss(agent, rollout.batch(torch.arange(128)), PPOConfig())
     (1000 * loss).backward()
     assert float(ppo.clip_gradient(agent, 0.5)) > 0.5
@@ -271,34 +344,10 @@ def test_large_but_finite_numbers_are_no_alarm():
 
 
 def test_an_exploding_gradient_is_named():
-    agent, optimizer, rollout = collected(toy_config("x"))
+    agent, optimizer, rollout = collected()
     rollout.advantage[3, 2] = math.nan
     with pytest.raises(TrainingDivergedError, match="loss is no longer finite: policy"):
-        ppo.update(agent, optimizer, rollout, PPOConfig(minibatch=128))
+        ppo.improve(agent, optimizer, rollout, PPOConfig(minibatch=128))
     next(agent.parameters()).grad = torch.full_like(next(agent.parameters()), math.inf)
     with pytest.raises(TrainingDivergedError, match=r"gradient.*encoder.language"):
         ppo.clip_gradient(agent, 0.5)
-
-
-@pytest.mark.parametrize("critic", ["asymmetric", "shared"])
-def test_ppo_learns_to_reach_the_named_number(critic, tmp_path):
-    config = toy_config(tmp_path)
-    config = replace(config, agent=replace(config.agent, critic=critic))
-    envs, stack = ToyVectorEnv(8), StateStack(3)
-    state = stack.reset(envs.reset(seed=0)[0])
-    torch.manual_seed(0)
-    agent = Agent(config.agent, StateSpec.of(state, 2))
-    optimizer = torch.optim.Adam(agent.parameters(), 3e-3)
-    rollout = Rollout(32, state, 2)
-    rewards = []
-    for _ in range(12):
-        state, sums = collect(envs, stack, state, agent, rollout, config.ppo)
-        rollout.finish(agent.value(state).detach(), 0.9, 0.95)
-        ppo.update(agent, optimizer, rollout, config.ppo)
-        rewards.append(sums.means()["reward"])
-    assert rewards[0] < 0.35
-    for told, goal in enumerate(GOALS):
-        state = stack.reset(envs.reset(seed=9, options={"instruction": told})[0])
-        for _ in range(6):
-            state = stack.push(envs.step(agent.policy(state))[0])
-        assert (envs.joints[:, 0] - goal).abs().max() < 0.2

@@ -3,6 +3,8 @@ import csv
 import dataclasses
 import itertools
 import json
+import math
+import shutil
 
 import pytest
 import torch
@@ -11,13 +13,24 @@ from toy_envs import LENGTH, SENTENCES, ToyVectorEnv, toy_config
 
 import ir_maniskill
 from ir_maniskill import experiment as catalog
-from ir_maniskill.agent.actor import Actor
-from ir_maniskill.environment.reward_generator import DenseWeights
+from ir_maniskill.agent import Agent, StateSpec
 from ir_maniskill.evaluation.evaluate import EvaluationReport, Rate, Score
-from ir_maniskill.training import checkpoint, distributed
+from ir_maniskill.training import checkpoint, distributed, ppo, run_folder, runner
 from ir_maniskill.training import train as training
+from ir_maniskill.training.algorithm import (
+    Algorithm,
+    averages,
+    copied,
+    load_averages,
+    under,
+)
 from ir_maniskill.training.checkpoint import CheckpointError
-from ir_maniskill.training.config import AgentConfig, ConfigError, TrainConfig
+from ir_maniskill.training.config import (
+    AgentConfig,
+    ConfigError,
+    TrainConfig,
+    to_json,
+)
 from ir_maniskill.training.finite import TrainingDivergedError
 from ir_maniskill.training.run_folder import RunFolder
 from ir_maniskill.training.train import train
@@ -27,12 +40,13 @@ UPDATE = 32 * LENGTH  # steps of an update of the toy task
 
 @pytest.fixture(autouse=True)
 def few_final_episodes(monkeypatch):
-    monkeypatch.setattr(training, "FINAL_EPISODES", 16)
+    monkeypatch.setattr(runner, "FINAL_EPISODES", 16)
 
 
 def run(config, **kwargs):
     envs = ToyVectorEnv(config.num_envs, env_id=config.env_id)
-    return train(config, envs=envs, **kwargs)
+    given = {"envs": envs, "eval_envs": ToyVectorEnv(4)}
+    return train(config, **(given | kwargs))
 
 
 def rows(folder, table):
@@ -55,32 +69,25 @@ def interrupt(monkeypatch):
     """Make the training stop in its n-th update, as if by Ctrl-C."""
 
     def at(count, error=KeyboardInterrupt):
-        update, calls = training.ppo.update, []
+        improve, calls = ppo.improve, []
 
         def interrupted(*arguments):
             calls.append(None)
             if len(calls) == count:
                 raise error
-            return update(*arguments)
+            return improve(*arguments)
 
-        monkeypatch.setattr(training.ppo, "update", interrupted)
+        monkeypatch.setattr(ppo, "improve", interrupted)
 
     return at
 
 
-def test_training_learns_the_toy_task_and_stops_when_told(tmp_path):
-    ppo = dataclasses.replace(toy_config(tmp_path).ppo, learning_rate=3e-3)
-    config = toy_config(
-        tmp_path,
-        ppo=ppo,
-        total_steps=60 * UPDATE,
-        eval_interval=3 * UPDATE,
-        stop_at_success=1.0,
-    )
+def test_training_learns_the_toy_task_and_keeps_the_best_policy(tmp_path):
+    learner = dataclasses.replace(toy_config(tmp_path).ppo, learning_rate=3e-3)
+    steps = {"total_steps": 16 * UPDATE, "eval_interval": 8 * UPDATE}
+    config = toy_config(tmp_path, ppo=learner, **steps)
     best = run(config)
     assert best == tmp_path / "best.safetensors"
-    steps = [int(row["steps"]) for row in rows(tmp_path, "metrics")]
-    assert steps[-1] < 60 * UPDATE
     assert float(rows(tmp_path, "evaluations")[-1]["eval/worst"]) == 1.0
     report = json.loads((tmp_path / "evaluation.json").read_text())
     assert (report["episodes"], report["overall"]["success"]) == (16, 1.0)
@@ -89,30 +96,17 @@ def test_training_learns_the_toy_task_and_stops_when_told(tmp_path):
     assert metadata["evaluation"] == report
 
 
-@pytest.mark.parametrize(
-    ("reward", "each_finger", "best"),
-    [("binary", False, 1), ("binary", True, 2), ("per_finger", False, 2)],
-)
-def test_the_best_policy_holds_longest_or_with_the_most_fingers(
-    tmp_path, monkeypatch, reward, each_finger, best
-):
-    rates = {"success": Rate(4, 4), "exclusive": Rate(4, 4)}
-    scores = [
-        Score(**rates, touching=t, right_fingers=f, wrong_fingers=0, mean_return=0)
-        for t, f in ((0.9, 0.9), (0.8, 1.6), (0.7, 0.7))
-    ]
-    reports = iter(
-        EvaluationReport("Toy-v1", 0, 4, dict.fromkeys(SENTENCES, score), score)
-        for score in (*scores, scores[0])
-    )
-    monkeypatch.setattr(training, "evaluate_policy", lambda *_, **__: next(reports))
-    envs = ToyVectorEnv()
-    envs.experiment.reward = reward
-    config = toy_config(tmp_path, total_steps=3 * UPDATE, eval_interval=UPDATE)
-    weights = DenseWeights(each_finger=each_finger)
-    path = train(dataclasses.replace(config, dense_weights=weights), envs=envs)
-    _, _, metadata = checkpoint.load_policy(path)
-    assert metadata["steps"] == best * UPDATE
+def test_the_best_policy_reaches_the_goal_and_holds_it_with_many_fingers():
+    def score(success, touching, fingers):
+        rates = {"success": Rate(success, 4), "exclusive": Rate(4, 4)}
+        means = {"touching": touching, "right_fingers": fingers}
+        each = Score(**rates, **means, wrong_fingers=0, mean_return=0)
+        report = EvaluationReport("T-v1", 0, 4, dict.fromkeys(SENTENCES, each), each)
+        return runner.score_of(report, fingers=2)
+
+    assert score(3, 0.5, 1.0) == 0.75 + 1 + 0.5 + 0.5
+    assert score(4, 0.5, 1.0) > score(3, 0.6, 1.2)
+    assert score(4, 0.5, 1.5) > score(4, 0.5, 1.0)
 
 
 def test_training_leaves_its_records(tmp_path):
@@ -138,7 +132,8 @@ def test_a_run_resumed_at_a_checkpoint_equals_one_never_interrupted(
         return toy_config(tmp_path / name, agent=agent, **changes)
 
     def go(config, **kwargs):
-        train(config, envs=ToyVectorEnv(8, images=images), **kwargs)
+        envs, evaluated_in = (ToyVectorEnv(8, images=images) for _ in range(2))
+        train(config, envs=envs, eval_envs=evaluated_in, **kwargs)
 
     go(config("whole"))
     interrupt(3)  # after the checkpoint that follows the second update
@@ -155,10 +150,11 @@ def test_a_run_resumed_at_a_checkpoint_equals_one_never_interrupted(
     assert first == second
 
 
-def test_evaluating_changes_nothing_in_the_weights_to_come(tmp_path):
-    each = {"checkpoint_interval": UPDATE}
-    run(toy_config(tmp_path / "never", **each))
-    run(toy_config(tmp_path / "often", eval_interval=UPDATE, **each))
+def test_an_evaluation_alone_changes_nothing(tmp_path):
+    never = {"checkpoint_interval": 10**6}
+    run(toy_config(tmp_path / "never", **never))
+    run(toy_config(tmp_path / "often", eval_interval=UPDATE, **never))
+    assert len(rows(tmp_path / "often", "evaluations")) == 4
     assert_same(tensors(tmp_path / "never"), tensors(tmp_path / "often"))
 
 
@@ -184,7 +180,7 @@ def test_whatever_stops_it_the_last_complete_update_is_kept(tmp_path, interrupt,
 @pytest.mark.parametrize(
     ("owner", "name", "late"),
     [
-        (training, "evaluate_policy", False),
+        (runner, "evaluate_policy", False),
         (checkpoint, "save_policy", True),
         (RunFolder, "log", True),
     ],
@@ -193,6 +189,7 @@ def test_an_evaluation_that_is_interrupted_is_made_on_resuming(
     tmp_path, monkeypatch, owner, name, late
 ):
     changes = {"total_steps": 2 * UPDATE, "eval_interval": UPDATE}
+    changes["checkpoint_interval"] = UPDATE
     run(toy_config(tmp_path / "whole", **changes))
     work, calls = getattr(owner, name), itertools.count()
 
@@ -242,12 +239,46 @@ def test_curves_have_no_points_of_steps_made_again(tmp_path, interrupt):
     assert steps == [UPDATE * i for i in (1, 2, 3, 4)]
 
 
-def test_a_finished_run_can_be_prolonged(tmp_path):
-    run(toy_config(tmp_path, total_steps=UPDATE))
-    run(toy_config(tmp_path, total_steps=2 * UPDATE), resume=True)
-    assert (
-        checkpoint.read(tmp_path / "last.safetensors").metadata["steps"] == 2 * UPDATE
+def test_a_run_goes_on_with_its_own_config_but_for_what_is_given(tmp_path):
+    config = toy_config(tmp_path, total_steps=UPDATE, seed=3)
+    run(config)
+    with pytest.raises(ConfigError, match=r"\(run: 3, now: 5\)"):
+        again = TrainConfig(out=str(tmp_path), seed=5, total_steps=2 * UPDATE)
+        train(again, resume=True, envs=ToyVectorEnv())
+    again = TrainConfig(out=str(tmp_path), total_steps=2 * UPDATE)
+    train(again, resume=True, envs=ToyVectorEnv(), eval_envs=ToyVectorEnv())
+    stored = checkpoint.read(tmp_path / "last.safetensors")
+    assert stored.metadata["steps"] == 2 * UPDATE
+    longer = dataclasses.replace(config, total_steps=2 * UPDATE)
+    assert (tmp_path / "config.json").read_text() == to_json(longer) + "\n"
+
+
+def test_a_run_that_ends_while_another_waits_for_its_folder_is_not_overwritten(
+    tmp_path, monkeypatch
+):
+    ended = toy_config(tmp_path / "ended", total_steps=2 * UPDATE)
+    run(dataclasses.replace(ended, total_steps=UPDATE))
+    folder = tmp_path / "waiting"
+    shutil.copytree(tmp_path / "ended", folder)
+    run(ended, resume=True)
+    lock, steps = run_folder.fcntl.flock, []
+
+    def lock_late(*arguments):
+        shutil.copytree(tmp_path / "ended", folder, dirs_exist_ok=True)
+        lock(*arguments)
+
+    monkeypatch.setattr(run_folder.fcntl, "flock", lock_late)
+    restore = runner.Runner.restore
+    monkeypatch.setattr(
+        runner.Runner,
+        "restore",
+        lambda self, stored: (
+            restore(self, stored),
+            steps.append(stored.metadata["steps"]),
+        ),
     )
+    run(toy_config(folder, total_steps=3 * UPDATE), resume=True)
+    assert steps == [2 * UPDATE]
 
 
 def test_a_folder_with_a_run_is_not_overwritten(tmp_path):
@@ -313,24 +344,10 @@ def test_too_few_episodes_for_the_sentences_are_refused_before_training(tmp_path
 
 
 def test_the_last_evaluation_has_an_episode_for_every_sentence(tmp_path, monkeypatch):
-    monkeypatch.setattr(training, "FINAL_EPISODES", 1)
+    monkeypatch.setattr(runner, "FINAL_EPISODES", 1)
     run(toy_config(tmp_path, total_steps=UPDATE))
     report = json.loads((tmp_path / "evaluation.json").read_text())
-    assert (report["episodes"], report["reward_mode"]) == (2, "dense")
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"env_id": "Other-v1"}, "env_id .checkpoint: 'Toy-v1', now: 'Other-v1'"),
-        ({"seed": 5}, "seed .checkpoint: 0, now: 5"),
-    ],
-)
-def test_another_task_or_config_cannot_be_resumed(tmp_path, change, message):
-    config = toy_config(tmp_path, total_steps=UPDATE)
-    run(config)
-    with pytest.raises(CheckpointError, match=message):
-        run(dataclasses.replace(config, **change), resume=True)
+    assert report["episodes"] == 2
 
 
 def test_a_broken_checkpoint_is_refused(tmp_path):
@@ -342,30 +359,10 @@ def test_a_broken_checkpoint_is_refused(tmp_path):
         run(config, resume=True)
 
 
-@pytest.mark.parametrize("rate", [0.0, float("nan"), "fast"])
-def test_a_step_size_that_cannot_be_is_refused(tmp_path, rate):
-    config = toy_config(tmp_path, total_steps=UPDATE)
-    run(config)
-    last = tmp_path / "last.safetensors"
-    stored = checkpoint.read(last)
-    stored.metadata["learning_rate"] = rate
-    checkpoint.write(last, stored)
-    with pytest.raises(CheckpointError, match="learning_rate: got"):
-        run(config, resume=True)
-
-
 def test_a_folder_that_cannot_be_written_is_refused_before_training(tmp_path):
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(CheckpointError, match=r"cannot write to .*choose another"):
         run(toy_config(tmp_path / "file" / "run"))
-
-
-def test_a_full_disk_is_refused_before_training(tmp_path, monkeypatch):
-    usage = training.RunFolder.__init__.__globals__["shutil"].disk_usage(tmp_path)
-    full = usage._replace(free=1_000_000)
-    monkeypatch.setattr("shutil.disk_usage", lambda _: full)
-    with pytest.raises(CheckpointError, match="got 1 MB of free space"):
-        run(toy_config(tmp_path))
 
 
 def test_divergence_keeps_the_last_good_checkpoint(tmp_path, monkeypatch):
@@ -381,7 +378,7 @@ def test_divergence_keeps_the_last_good_checkpoint(tmp_path, monkeypatch):
 
     envs.step = explode
     with pytest.raises(TrainingDivergedError, match=r"observation.*: proprioception"):
-        train(toy_config(tmp_path), envs=envs)
+        run(toy_config(tmp_path), envs=envs)
     stored = checkpoint.read(tmp_path / "last.safetensors")
     assert stored.metadata["steps"] == 2 * UPDATE
     assert all(v.isfinite().all() for v in stored.tensors.values())
@@ -401,50 +398,132 @@ def test_a_reward_that_is_no_number_is_named(tmp_path):
     assert checkpoint.read(tmp_path / "last.safetensors").metadata["steps"] == 0
 
 
-@pytest.mark.parametrize(
-    ("mode", "expected"),
-    [("annealed", [0.5, 0.4, 0.3, 0.2]), ("decayed", [0.8, 0.4, 0.2, 0.1])],
-)
-def test_the_noise_shrinks_as_steps_are_made(tmp_path, mode, expected):
-    config = toy_config(tmp_path)
-    final = {"annealed": 0.1, "decayed": 0.05}[mode]
-    noise = {"std_mode": mode, "std": expected[0], "std_final": final}
-    run(dataclasses.replace(config, agent=dataclasses.replace(config.agent, **noise)))
-    got = [float(row["std"]) for row in rows(tmp_path, "metrics")]
-    assert got == pytest.approx(expected, abs=1e-4)
+def test_noise_and_penalties_follow_the_share_of_the_steps(tmp_path):
+    config = toy_config(tmp_path, penalty_warmup=0.5)
+    learner = dataclasses.replace(config.ppo, std=0.5, std_final=0.1)
+    run(dataclasses.replace(config, ppo=learner))
+    got = rows(tmp_path, "metrics")
+    noise = [float(row["std"]) for row in got]
+    assert noise == pytest.approx([0.5, 0.4, 0.3, 0.2], abs=1e-4)
+    assert [float(row["penalty"]) for row in got] == [0, 0.5, 1, 1]
 
 
-def test_the_posture_gain_changes_as_steps_are_made_and_is_kept(tmp_path, monkeypatch):
-    gains, set_gain = [], Actor.set_gain
-    monkeypatch.setattr(
-        Actor,
-        "set_gain",
-        lambda actor, gain: (gains.append(gain), set_gain(actor, gain)),
-    )
-    config = toy_config(tmp_path)
-    changes = {"posture_gain": 1.0, "posture_gain_final": 2.0}
-    run(dataclasses.replace(config, agent=dataclasses.replace(config.agent, **changes)))
-    assert gains == pytest.approx([1, 1.25, 1.5, 1.75])
-    agent, _, _ = checkpoint.load_policy(tmp_path / "best.safetensors")
-    assert float(agent.actor.posture_gain) == 1.75
+def test_what_final_infos_say_of_episodes_that_go_on_does_not_count():
+    def info(first, second):
+        values = torch.tensor([first, second])
+        fingers = {"right_fingers": values, "wrong_fingers": 0 * values}
+        once = {"success_once": values > 0, "exclusive_success": values > 0}
+        return {**fingers, **once, "reward_terms": values[:, None]}
+
+    done, counts = torch.tensor([True, False]), runner.StepCounts()
+    stale = {**info(0, 1), "final_info": info(1, 5)}  # the first episode has ended
+    merged = runner.info_of_step(stale, done)
+    assert merged["right_fingers"].tolist() == [1, 1]
+    assert merged["reward_terms"].tolist() == [[1], [1]]
+    stale["right_fingers"][1], stale["success_once"][1] = 0, False
+    counts.add(torch.zeros(2), done, runner.info_of_step(stale, done))
+    assert (counts.touching, counts.success, counts.episodes) == (1, 1, 1)
 
 
-def test_other_objects_get_their_price_as_steps_are_made(tmp_path):
-    prices = []
-    envs = ToyVectorEnv()
-    envs.set_attr = lambda name, value: prices.append((name, value.wrong))
-    train(toy_config(tmp_path, lenient_steps=2 * UPDATE), envs=envs)
-    usual = DenseWeights().wrong
-    expected = [0, usual / 2, usual, usual]
-    assert prices == [("dense_weights", price) for price in expected]
+def test_where_no_episode_ended_there_are_no_figures_of_episodes():
+    means = runner.StepCounts(steps=4, reward=2.0, touching=1).means()
+    assert (means["reward"], means["touching"]) == (0.5, 0.25)
+    assert all(math.isnan(means[name]) for name in ("return", "success", "exclusive"))
+
+
+# -- Another algorithm -----------------------------------------------------------------
+
+
+class CopyTheBest(Algorithm):
+    """Tries what the policy says and noise, keeps what was rewarded, and copies it.
+
+    It has a replay and makes a gradient every four steps: nothing of PPO's.
+    """
+
+    SIZE, BATCH = 512, 64
+
+    def __init__(self, config, state, actions):
+        self.agent = Agent(config.agent, StateSpec.of(state, actions))
+        self.optimizer = torch.optim.Adam(self.agent.parameters(), 3e-3)
+        samples = {"action": torch.zeros(1, actions), **state}
+        self.replay = {
+            name: value.new_zeros(self.SIZE, *value.shape[1:])
+            for name, value in samples.items()
+        }
+        self.count = torch.zeros(2, dtype=torch.long)  # steps made, samples kept
+
+    def act(self, state):
+        noise = torch.randn(len(state["instruction"]), self.agent.spec.actions)
+        action = (self.agent.policy(state) + (1 - self.share) * noise).clamp(-1, 1)
+        self.tried = {"action": action, **state}
+        return action
+
+    def observe(self, outcome):
+        good = outcome.reward > 0
+        kept = int(good.sum())
+        rows = (self.count[1] + torch.arange(kept)) % self.SIZE
+        for name, values in self.tried.items():
+            self.replay[name][rows] = values[good]
+        self.count += torch.tensor([1, kept])
+
+    def update(self):
+        steps, kept = self.count.tolist()
+        if steps % 4 or kept < self.BATCH:
+            return {}
+        rows = torch.randint(min(kept, self.SIZE), (self.BATCH,))
+        batch = {name: values[rows] for name, values in self.replay.items()}
+        likely = self.agent.evaluate_actions(batch, batch["action"]).log_prob
+        self.optimizer.zero_grad()
+        (-likely.mean()).backward()
+        self.optimizer.step()
+        return {"loss/copy": -float(likely.mean().detach())}
+
+    def state_dict(self):
+        agent = copied("agent", self.agent.state_dict())
+        moments = copied("optimizer", averages(self.optimizer))
+        return agent | moments | copied("kept", {**self.replay, "count": self.count})
+
+    def load_state_dict(self, tensors):
+        self.agent.load_state_dict(under("agent", tensors))
+        load_averages(self.optimizer, under("optimizer", tensors))
+        kept = {k: v.clone() for k, v in under("kept", tensors).items()}
+        self.count = kept.pop("count")
+        self.replay = kept
+
+
+def test_the_runner_trains_checkpoints_and_resumes_an_off_policy_algorithm(
+    tmp_path, monkeypatch
+):
+    def config(name):
+        steps = {"total_steps": 5000, "checkpoint_interval": 1000}
+        return toy_config(tmp_path / name, eval_interval=2500, **steps)
+
+    run(config("whole"), algorithm=CopyTheBest)
+    assert float(rows(tmp_path / "whole", "evaluations")[-1]["eval/worst"]) == 1.0
+    restart, calls = Algorithm.restart, itertools.count(1)
+
+    def stop(self):  # at the third checkpoint
+        if next(calls) == 3:
+            raise KeyboardInterrupt
+        restart(self)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Algorithm, "restart", stop)
+        run(config("halves"), algorithm=CopyTheBest)
+    torch.manual_seed(123)
+    run(config("halves"), algorithm=CopyTheBest, resume=True)
+    assert_same(tensors(tmp_path / "whole"), tensors(tmp_path / "halves"))
+
+
+# -- The real task ---------------------------------------------------------------------
 
 
 @pytest.mark.slow
 @pytest.mark.render
 def test_the_real_task_resumes_bit_for_bit(tmp_path, interrupt):
     def config(name):
-        update = {"rollouts": 4, "epochs": 2, "minibatch": 64}
-        ppo = dataclasses.replace(TrainConfig().ppo, **update)
+        update = {"steps_per_update": 128, "epochs": 2, "minibatch": 64}
+        learner = dataclasses.replace(TrainConfig().ppo, **update)
         intervals = {"checkpoint_interval": 128, "eval_interval": 10**6}
         return TrainConfig(
             out=str(tmp_path / name),
@@ -453,7 +532,7 @@ def test_the_real_task_resumes_bit_for_bit(tmp_path, interrupt):
             num_workers=2,
             threads=1,
             eval_episodes=4,
-            ppo=ppo,
+            ppo=learner,
             **intervals,
         )
 

@@ -27,6 +27,7 @@ def toy_state(n=3):
         "target": torch.rand(n, 3, JOINTS),
         "touch": torch.zeros(n, 3, FINGERS),
         "privileged": torch.rand(n, 7),
+        "named_position": torch.rand(n, 3),
     }
 
 
@@ -46,7 +47,6 @@ class ToyVectorEnv:
             sentences=SENTENCES,
             senses=senses,
             vocabulary=VOCABULARY,
-            reward="binary",
         )
         self.joints = torch.zeros(num_envs, JOINTS)
         self.told = torch.zeros(num_envs, dtype=torch.long)
@@ -77,8 +77,10 @@ class ToyVectorEnv:
         }
         truncated = self.clock >= LENGTH
         if truncated.any():
-            info = {"final_observation": self._observe(), "final_info": info}
+            ended = {"final_observation": self._observe(), "final_info": info}
             self._start(truncated)
+            info = {name: torch.zeros_like(value) for name, value in info.items()}
+            info |= ended
         return self._observe(), right.float(), torch.zeros_like(right), truncated, info
 
     def close(self):
@@ -120,7 +122,7 @@ class ToyVectorEnv:
 def toy_config(out, **changes):
     """Return a config with which the toy task is learned in seconds."""
     agent = AgentConfig(senses=("proprioception",), hidden=(32, 32), language_layers=1)
-    ppo = PPOConfig(rollouts=32, rollout_length=LENGTH, epochs=8, minibatch=64)
+    ppo = PPOConfig(32 * LENGTH, epochs=8, minibatch=64, gamma=0.95, std=0.5)
     values = {
         "env_id": "Toy-v1",
         "out": str(out),

@@ -32,7 +32,6 @@ class Actor(nn.Module):
     """
 
     log_std: Tensor
-    posture_gain: float | Tensor
 
     def __init__(
         self,
@@ -40,24 +39,14 @@ class Actor(nn.Module):
         hidden: Sequence[int],
         actions: int,
         *,
-        std: float,
-        learn_std: bool,
         posture_gain: float = 0.0,
-        gain_changes: bool = False,
     ) -> None:
         """Make the layers; at first they give about 0, the middle of each joint."""
         super().__init__()
         self.aims = posture_gain > 0
-        if gain_changes:  # then it belongs to what is learned, and is stored with it
-            self.register_buffer("posture_gain", torch.tensor(posture_gain))
-        else:
-            self.posture_gain = posture_gain
+        self.posture_gain = posture_gain
         self.mean = tanh_layers(inputs, hidden, actions, gain=0.01)
-        log_std = torch.full((actions,), math.log(std))
-        if learn_std:
-            self.log_std = nn.Parameter(log_std)
-        else:
-            self.register_buffer("log_std", log_std)
+        self.register_buffer("log_std", torch.zeros(actions))
 
     def forward(self, aligned: Tensor, target: Tensor) -> Normal:
         """Return the distribution of a_t [N, A].
@@ -72,11 +61,6 @@ class Actor(nn.Module):
         std = self.log_std.exp().expand_as(mean)
         return Normal(mean, std, validate_args=False)
 
-    def set_gain(self, gain: float) -> None:
-        """Set a posture gain that changes (a schedule's)."""
-        assert isinstance(self.posture_gain, Tensor), "made with a gain that stays"
-        self.posture_gain.fill_(gain)
-
     def set_std(self, std: float) -> None:
-        """Set the deviation of every action (a schedule's, not a learned one)."""
+        """Set the deviation of every action (a schedule's)."""
         self.log_std.data.fill_(math.log(std))

@@ -177,10 +177,7 @@ class Agent(nn.Module):
             self.encoder.width,
             config.hidden,
             spec.actions,
-            std=config.std,
-            learn_std=config.std_mode == "learned",
             posture_gain=config.posture_gain,
-            gain_changes=config.posture_gain_final is not None,
         )
         self.critic_encoder: StateEncoder | None = None
         self.critic: Critic | None = None

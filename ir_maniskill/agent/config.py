@@ -8,8 +8,7 @@ from ir_maniskill.checks import require, require_choice
 
 Sense = Literal["vision", "proprioception", "touch", "state"]
 Vision = Literal["patches", "paper"]
-CriticInput = Literal["asymmetric", "separate", "shared"]
-StdMode = Literal["annealed", "decayed", "fixed", "learned"]
+CriticInput = Literal["asymmetric", "separate"]
 
 
 @dataclass(frozen=True)
@@ -44,21 +43,11 @@ class AgentConfig:
     posture_gain: float = 0.0
     """How strongly mean actions, changes of the joint targets, draw these toward the
     posture that the actor's layers then give; 0: the layers give the action itself."""
-    posture_gain_final: float | None = None
-    """The same at the end, approached by the same amount each step; None: it stays."""
     hidden: tuple[int, ...] = (500, 256, 128)
     """Units of the actor's and the critic's tanh layers."""
     critic: CriticInput = "asymmetric"
-    """What the critic reads: the simulator's state instead of images, its own encoder
-    of the actor's senses, or the actor's B_t."""
-    std_mode: StdMode = "annealed"
-    """How the standard deviation of the action noise evolves: to `std_final` by the
-    same amount ("annealed") or the same factor ("decayed") each step, not at all, or as
-    it is learned."""
-    std: float = 0.5
-    """Standard deviation of the action noise at the start."""
-    std_final: float = 0.05
-    """Standard deviation at the end, if annealed or decayed."""
+    """What the critic reads: the simulator's state instead of images, or what the actor
+    senses, by an encoder of its own."""
     auxiliary_weight: float = 3.0
     """Weight of the loss that predicts where the named object is; 0: no such head."""
 
@@ -69,7 +58,6 @@ class AgentConfig:
         require(self.senses != (), "senses", self.senses, "at least one, or None")
         require_choice("vision", self.vision, Vision)
         require_choice("critic", self.critic, CriticInput)
-        require_choice("std_mode", self.std_mode, StdMode)
         positive = "vocabulary language_layers language_heads vision_width body_width"
         for name in positive.split():
             require(getattr(self, name) > 0, name, getattr(self, name), "at least 1")
@@ -80,8 +68,6 @@ class AgentConfig:
             units = getattr(self, name)
             fits = bool(units) and min(units) > 0
             require(fits, name, units, "one or more positive sizes")
-        require(self.std > 0, "std", self.std, "more than 0")
-        require(self.std_final > 0, "std_final", self.std_final, "more than 0")
         weight = self.auxiliary_weight
         require(weight >= 0, "auxiliary_weight", weight, "0 or more")
         gain, senses = self.posture_gain, self.senses
@@ -92,7 +78,3 @@ class AgentConfig:
         fits = gain == 0 or (felt and self.sees_target)
         expected = "0 where the actor does not feel its joint targets"
         require(fits, "posture_gain", gain, expected)
-        final = self.posture_gain_final
-        fits = final is None or (gain > 0 and 0 < final < math.inf)
-        expected = "a finite number above 0 beside a posture_gain above 0, or None"
-        require(fits, "posture_gain_final", final, expected)

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from ir_maniskill.agent.agent import Agent, StateSpec
 from ir_maniskill.environment.state import State
-from ir_maniskill.training.config import TrainConfig, decode
+from ir_maniskill.training.config import TrainConfig, decode, from_data, to_data
 from ir_maniskill.training.finite import check_finite
 from ir_maniskill.training.quantize import dequantize, quantize
 
@@ -180,7 +180,7 @@ def describe(agent: Agent, config: TrainConfig, **facts: object) -> dict[str, An
     """Return the metadata that every file carries."""
     resolved = dataclasses.replace(config, agent=agent.config)
     return {
-        "config": dataclasses.asdict(resolved),
+        "config": to_data(resolved),
         "spec": dataclasses.asdict(agent.spec),
         "env_id": config.env_id,
         "seed": config.seed,
@@ -229,7 +229,7 @@ def load_policy(path: Path | str) -> tuple[Agent, TrainConfig, dict[str, Any]]:
     """
     stored = read(Path(path))
     try:
-        config = decode(TrainConfig, stored.metadata["config"])
+        config = from_data(stored.metadata["config"])
         spec = decode(StateSpec, stored.metadata["spec"])
         agent = _agent(config, spec, stored)
     except MALFORMED as error:

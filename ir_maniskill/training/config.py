@@ -1,13 +1,16 @@
 """Every number of a training run, as frozen dataclasses that survive JSON.
 
-`CONFIGS["paper"]` holds what the paper and its reference code say, `CONFIGS["default"]`
-our tuned values; both run the same code.
+`CONFIGS["default"]` holds our tuned values, `CONFIGS["vision"]` those for pictures
+alone, `CONFIGS["paper"]` what the paper and its reference code say; all run the same
+code.
 """
 
 import dataclasses
 import json
+import math
 import types
 import typing
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
@@ -16,39 +19,44 @@ from ir_maniskill.checks import ConfigError, require, require_choice
 from ir_maniskill.environment.reward_generator import RewardWeights
 
 ControlMode = Literal["pd_joint_target_delta_pos", "pd_joint_pos"]
-RewardMode = Literal["dense", "normalized_dense", "sparse"]
+RewardMode = Literal["dense", "sparse"]
 SimBackend = Literal["physx_cpu", "physx_cuda"]
 RenderBackend = Literal["auto", "cpu"]
 
 Config = TypeVar("Config")
+
+SCHEMA = 2
+"""Version of the form in which configs are written."""
+
+MAY_CHANGE = {
+    *("out", "total_steps"),
+    *("sim_backend", "render_backend", "num_workers", "threads"),
+    *("eval_interval", "eval_episodes", "checkpoint_interval"),
+}
+"""Fields that a resumed run may have anew."""
 
 
 @dataclass(frozen=True)
 class PPOConfig:
     """Proximal policy optimization."""
 
-    rollouts: int = 64
-    """Roll-outs collected for each update, over all ranks."""
-    rollout_length: int = 32
-    """Steps of each roll-out (an episode of 32 steps of 50 ms)."""
+    steps_per_update: int = 2048
+    """Steps collected for each update, over all envs and ranks; rounded up to whole
+    steps of all envs."""
     epochs: int = 5
     """Passes over the collected steps, at most."""
     minibatch: int | None = 256
     """Steps of each gradient; None: all of them."""
     learning_rate: float = 3e-4
     """Adam's step size, at the start if there is a `target_kl`."""
-    gamma: float = 0.95
+    gamma: float = 0.9
     """Discount of a step."""
     gae_lambda: float = 0.95
     """Decay of generalized advantage estimation; 1: Monte-Carlo returns."""
     bootstrap: bool = True
-    """Whether the value of the last observation stands for what the time limit cut."""
+    """Whether the value of the last observation stands for what truncation hides."""
     clip: float = 0.2
     """Largest change of an action's probability ratio that is rewarded."""
-    value_weight: float = 0.5
-    """Weight of the critic's loss."""
-    entropy_weight: float = 0.0
-    """Weight of the entropy bonus (only a learned std feels it)."""
     max_kl: float | None = 0.05
     """No further epoch once the policy moved this far [nat]; None: all epochs."""
     target_kl: float | None = 0.015
@@ -57,23 +65,24 @@ class PPOConfig:
     most; None: it stays."""
     max_grad_norm: float | None = 0.5
     """Longest gradient; None: any."""
-    normalize_reward: bool = True
-    """Whether rewards are divided by the running deviation of the returns."""
+    std: float = 1.0
+    """Standard deviation of the action noise at the start."""
+    std_final: float = 0.05
+    """Standard deviation at the end, approached by the same amount each step."""
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
-        for name in ("rollouts", "rollout_length", "epochs"):
+        for name in ("steps_per_update", "epochs"):
             require(getattr(self, name) > 0, name, getattr(self, name), "at least 1")
-        batch, total = self.minibatch, self.rollouts * self.rollout_length
+        batch, total = self.minibatch, self.steps_per_update
         fits = batch is None or 2 <= batch <= total
         require(fits, "minibatch", batch, f"2 to {total} steps, or None")
         for name in ("gamma", "gae_lambda"):
             value = getattr(self, name)
             require(0 <= value <= 1, name, value, "0 to 1")
-        for name in ("learning_rate", "clip"):
-            require(getattr(self, name) > 0, name, getattr(self, name), "more than 0")
-        for name in ("value_weight", "entropy_weight"):
-            require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more")
+        for name in ("learning_rate", "clip", "std", "std_final"):
+            value = getattr(self, name)
+            require(0 < value < math.inf, name, value, "more than 0, and finite")
         for name in ("max_kl", "target_kl", "max_grad_norm"):
             value = getattr(self, name)
             require(value is None or value > 0, name, value, "more than 0, or None")
@@ -85,14 +94,16 @@ class TrainConfig:
 
     env_id: str = "NaoTouchCubeSingle-v1"
     """Task to learn."""
+    robot: str = "nao"
+    """Robot that learns it, by the name that `robot_uids` takes."""
     out: str = "runs/default"
     """Folder of the run: checkpoints, metrics, TensorBoard events."""
     seed: int = 0
     """Seed of weights, exploration and scenes."""
-    total_steps: int = 60_000
+    total_steps: int = 250_000
     """Environment steps, over all envs; rounded up to whole updates."""
     num_envs: int = 16
-    """Scenes simulated side by side, over all ranks; must divide `ppo.rollouts`."""
+    """Scenes simulated side by side, over all ranks."""
     sim_backend: SimBackend = "physx_cpu"
     """Where physics is computed: "physx_cpu" has worker processes on the cores,
     "physx_cuda" all envs in one batch on the GPU."""
@@ -101,19 +112,18 @@ class TrainConfig:
     num_workers: int | None = None
     """Simulator processes of each rank on the CPU; None: one a core."""
     threads: int | None = None
-    """Threads of each rank's update; None: one a core."""
+    """Threads of each rank's update; None: one a core, or one alone where waiting
+    threads would keep cores busy (OMP_WAIT_POLICY was not passive when torch began)."""
     control_mode: ControlMode = "pd_joint_target_delta_pos"
     """What an action means: "pd_joint_target_delta_pos" moves the joint targets,
     "pd_joint_pos" sets them (the paper's)."""
     reward_mode: RewardMode = "dense"
-    """Reward to learn from: "sparse" is the paper's, "dense" is shaped toward touching
-    the named object alone, "normalized_dense" is that over the most it can give."""
+    """Reward to learn from: "sparse" is the paper's, "dense" leads to the goal."""
     reward_weights: RewardWeights = field(default_factory=RewardWeights)
     """What counts how much in the dense reward."""
-    lenient_steps: int = 0
-    """Steps over which the prices of touching other objects (`dense_weights.wrong` and
-    `spoiled`) and of pushing the named one (`push`) grow from nothing to what they are:
-    first to touch, then to touch alone."""
+    penalty_warmup: float = 1 / 3
+    """Share of the training over which the dense reward's penalties grow from nothing
+    to what they are: first to reach the goal, then to reach it without a foul."""
     shader_pack: str | None = "unlit"
     """Shader pack of the cameras: "unlit" paints base colors and is by far the
     cheapest, "minimal" and "default" are lit; None: the task's own."""
@@ -125,16 +135,11 @@ class TrainConfig:
     """Observations stacked into a state."""
     eval_interval: int = 20_000
     """Steps from one evaluation to the next."""
-    eval_episodes: int = 30
+    eval_episodes: int = 90
     """Episodes of each evaluation, spread evenly over the instructions."""
-    eval_seed: int = 1_000_000
-    """Seed of the evaluation's scenes; those of training have seeds from 2**30 on."""
     checkpoint_interval: int = 20_000
     """Steps from one complete checkpoint to the next."""
-    stop_at_success: float | None = None
-    """Stop early once an evaluation's success, of the worst instruction, is this high;
-    None: use up all steps."""
-    agent: AgentConfig = field(default_factory=AgentConfig)
+    agent: AgentConfig = field(default_factory=lambda: AgentConfig(posture_gain=1.0))
     """The learner."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """How it learns."""
@@ -145,9 +150,8 @@ class TrainConfig:
         positive += "eval_interval eval_episodes checkpoint_interval"
         for name in positive.split():
             require(getattr(self, name) > 0, name, getattr(self, name), "at least 1")
-        lenient, total = self.lenient_steps, self.total_steps
-        expected = f"0 to {total}, the total_steps (a third of them, say)"
-        require(0 <= lenient <= total, "lenient_steps", lenient, expected)
+        warmup = self.penalty_warmup
+        require(0 <= warmup <= 1, "penalty_warmup", warmup, "0 to 1")
         for name in ("num_workers", "threads"):
             value = getattr(self, name)
             require(value is None or value > 0, name, value, "at least 1, or None")
@@ -155,30 +159,16 @@ class TrainConfig:
         require_choice("render_backend", self.render_backend, RenderBackend)
         require_choice("control_mode", self.control_mode, ControlMode)
         require_choice("reward_mode", self.reward_mode, RewardMode)
-        for name, bits in (("seed", 31), ("eval_seed", 29)):
-            value = getattr(self, name)
-            require(0 <= value < 2**bits, name, value, f"0 to 2**{bits} - 1")
+        require(0 <= self.seed < 2**31, "seed", self.seed, "0 to 2**31 - 1")
         gain = self.agent.posture_gain
         fits = gain == 0 or self.control_mode == "pd_joint_target_delta_pos"
         expected = "0 where actions do not change the joint targets (control_mode)"
         require(fits, "posture_gain", gain, expected)
-        rollouts = self.ppo.rollouts
-        fits = rollouts % self.num_envs == 0
-        require(fits, "num_envs", self.num_envs, f"a divisor of {rollouts} rollouts")
-        goal = self.stop_at_success
-        fits = goal is None or 0 < goal <= 1
-        expected = "more than 0, at most 1, or None"
-        require(fits, "stop_at_success", goal, expected)
 
     @property
     def steps_per_env(self) -> int:
         """T, the steps each env makes for one update."""
-        return self.ppo.rollouts * self.ppo.rollout_length // self.num_envs
-
-    @property
-    def steps_per_update(self) -> int:
-        """T x N, the steps all envs make for one update."""
-        return self.ppo.rollouts * self.ppo.rollout_length
+        return -(-self.ppo.steps_per_update // self.num_envs)
 
     @property
     def needs_state(self) -> bool:
@@ -199,6 +189,7 @@ class TrainConfig:
         if self.shader_pack is not None:
             cameras["shader_pack"] = self.shader_pack
         kwargs = {
+            "robot_uids": self.robot,
             "obs_mode": modes.get((sees, state), "state_dict"),
             "control_mode": self.control_mode,
             "reward_mode": "sparse",
@@ -212,33 +203,30 @@ class TrainConfig:
 
 CONFIGS: dict[str, TrainConfig] = {
     "default": TrainConfig(),
-    "posture": TrainConfig(
-        total_steps=250_000,
-        eval_episodes=90,
-        lenient_steps=80_000,
-        agent=AgentConfig(posture_gain=1.0, std=1.0),
-        ppo=PPOConfig(gamma=0.9),
+    "vision": TrainConfig(
+        total_steps=60_000,
+        eval_episodes=30,
+        agent=AgentConfig(senses=("vision",)),
+        ppo=PPOConfig(gamma=0.95, std=0.5),
     ),
     "paper": TrainConfig(
-        out="runs/paper",
         total_steps=150_000,
         num_envs=24,
         control_mode="pd_joint_pos",
         reward_mode="sparse",
         camera_height=128,
         camera_width=64,
+        eval_episodes=30,
         agent=AgentConfig(
             senses=None,
             sees_target=False,
             vision="paper",
             film=False,
             critic="separate",
-            std_mode="fixed",
-            std=0.36,
             auxiliary_weight=0.0,
         ),
         ppo=PPOConfig(
-            rollouts=24,
+            steps_per_update=24 * 32,
             epochs=60,
             minibatch=None,
             learning_rate=1e-5,
@@ -249,39 +237,105 @@ CONFIGS: dict[str, TrainConfig] = {
             max_kl=None,
             target_kl=None,
             max_grad_norm=None,
+            std=0.36,
+            std_final=0.36,
         ),
     ),
 }
-"""The named configurations: "paper" as published, "default" as tuned to touch,
-"posture" as tuned to hold with many fingers."""
+"""The named configurations: "default" for all that feel their joints, "vision" for
+pictures alone, "paper" as published."""
 
 
-LATER: dict[str, dict[str, object]] = {
-    "AgentConfig": {"posture_gain": 0.0, "posture_gain_final": None},
-    "TrainConfig": {
-        "lenient_steps": 0,
-        "render_backend": "auto",
-        "sim_backend": "physx_cpu",
-    },
-}
-"""Fields that older files lack, by class, with the values that those files meant."""
+# -- Files -----------------------------------------------------------------------------
 
 
-def to_json(config: object) -> str:
-    """Return the JSON text of a configuration dataclass."""
-    return json.dumps(dataclasses.asdict(config), indent=2)  # type: ignore[call-overload]
+def to_json(config: TrainConfig) -> str:
+    """Return the JSON text of a configuration."""
+    return json.dumps(to_data(config), indent=2)
+
+
+def to_data(config: TrainConfig) -> dict[str, Any]:
+    """Return a configuration as plain data, with the version of its form."""
+    return {"schema": SCHEMA, **dataclasses.asdict(config)}
+
+
+def from_data(data: object) -> TrainConfig:
+    """Return the configuration from plain data of this version or an earlier one.
+
+    Raises:
+        ConfigError: If a field is unknown, missing, of another type than declared, or
+            out of its range.
+    """
+    return decode(TrainConfig, migrate(data))
+
+
+def migrate(data: object) -> object:
+    """Return a config's plain data of any version in today's form, without `schema`.
+
+    What no dictionary is, or lacks what its version has, is left to `decode` to refuse.
+
+    Raises:
+        ConfigError: If a later version of the package wrote it.
+    """
+    if not isinstance(data, dict):
+        return data
+    fields = dict(data)
+    schema = fields.pop("schema", 1)
+    require(schema in range(1, SCHEMA + 1), "schema", schema, f"1 to {SCHEMA}")
+    return _from_version_1(fields) if schema == 1 else fields
+
+
+def _from_version_1(old: dict[str, Any]) -> dict[str, Any]:
+    """Return the plain data of 0.1 in the form of version 2; policies act as before."""
+    new = {"sim_backend": "physx_cpu", "render_backend": "auto", "robot": "nao", **old}
+    parts = ("agent", "ppo", "dense_weights")
+    if not all(isinstance(new.get(part), dict) for part in parts):
+        return new  # `decode` says what is missing
+    agent, ppo, dense = ({**new.pop(part)} for part in parts)
+    try:
+        new["penalty_warmup"] = new.pop("lenient_steps", 0) / new["total_steps"]
+        ppo["steps_per_update"] = ppo.pop("rollouts") * ppo.pop("rollout_length")
+        falls = agent.pop("std_mode") in ("annealed", "decayed")
+        ppo["std"], final = agent.pop("std"), agent.pop("std_final")
+        ppo["std_final"] = final if falls else ppo["std"]
+        new["reward_weights"] = {
+            "hold": 1.0,
+            "approach": dense["reach"],
+            "gather": dense["gather"],
+            "foul": dense["wrong"],
+            "speed": dense.get("push", 0.0),
+            "after_foul": dense["spoiled"],
+        }
+    except (KeyError, TypeError, ZeroDivisionError) as error:
+        raise ConfigError(
+            f"config of version 1: got one that is not whole ({error!r}), expected the "
+            "fields of ir_maniskill 0.1"
+        ) from error
+    # The policy that was kept acts with the gain of the end.
+    gain = agent.pop("posture_gain_final", None) or agent.get("posture_gain", 0.0)
+    new |= {"agent": agent | {"posture_gain": gain}, "ppo": ppo}
+    _drop(new, ("eval_seed", "stop_at_success"))
+    _drop(ppo, ("value_weight", "entropy_weight", "normalize_reward"))
+    if new.get("reward_mode") == "normalized_dense":
+        new["reward_mode"] = "dense"
+    return new
+
+
+def _drop(data: dict[str, Any], names: Iterable[str]) -> None:
+    """Remove fields that are no more."""
+    for name in names:
+        data.pop(name, None)
 
 
 def decode(cls: type[Config], data: object) -> Config:
-    """Return the dataclass `cls` from plain JSON data, strictly but for `LATER`.
+    """Return the dataclass `cls` from plain JSON data, strictly.
 
     Raises:
         ConfigError: If a field is unknown, missing, of another type than declared, or
             out of its range.
     """
     require(isinstance(data, dict), cls.__name__, data, "an object of its fields")
-    known = LATER.get(cls.__name__, {})
-    values = known | typing.cast("dict[str, object]", data)
+    values = typing.cast("dict[str, object]", data)
     hints = typing.get_type_hints(cls)
     unknown, missing = sorted(values.keys() - hints), sorted(hints.keys() - values)
     expected = f"exactly its fields (missing: {missing}, unknown: {unknown})"
@@ -312,3 +366,49 @@ def _decode(hint: Any, value: Any, name: str) -> Any:
         return float(value)
     require(type(value) is hint, name, value, f"a value of type {hint.__name__}")
     return value
+
+
+# -- Resuming --------------------------------------------------------------------------
+
+
+def resumed(stored: TrainConfig, given: TrainConfig) -> TrainConfig:
+    """Return the config with which a run goes on: its own, but for what may change.
+
+    Given counts what differs from `TrainConfig()`.
+
+    Raises:
+        ConfigError: If something else is given that differs from the run's config.
+    """
+    usual = leaves(TrainConfig())
+    told = {k: v for k, v in leaves(given).items() if v != usual[k] or k == "out"}
+    require_same(stored, leaves(stored) | told)
+    changes = {name: value for name, value in told.items() if name in MAY_CHANGE}
+    return dataclasses.replace(stored, **changes)
+
+
+def require_same(stored: TrainConfig, now: dict[str, Any]) -> None:
+    """Raise unless the leaves of a config are those of the run, or may change.
+
+    Raises:
+        ConfigError: Naming the fields that differ.
+    """
+    different = [
+        f"{name} (run: {value!r}, now: {now[name]!r})"
+        for name, value in leaves(stored).items()
+        if name not in MAY_CHANGE and now[name] != value
+    ]
+    if different:
+        raise ConfigError(
+            f"{stored.out} was begun with another config: {', '.join(different)}; "
+            "resume without them, or train in another folder"
+        )
+
+
+def leaves(config: object, prefix: str = "") -> dict[str, Any]:
+    """Return the fields of a config by name; those of its parts are `part.name`."""
+    found: dict[str, Any] = {}
+    for part in dataclasses.fields(config):  # type: ignore[arg-type]
+        value, name = getattr(config, part.name), prefix + part.name
+        inner = dataclasses.is_dataclass(value)
+        found |= leaves(value, f"{name}.") if inner else {name: value}
+    return found

@@ -76,6 +76,18 @@ def cores() -> int:
     return max(1, len(os.sched_getaffinity(0)) // sharing)
 
 
+def threads() -> int:
+    """Return how many threads an update may use.
+
+    GNU's OpenMP lets threads that wait for each other keep their cores busy, unless it
+    was told otherwise before torch loaded it (importing ir_maniskill first does that).
+    Where another program uses a core, updates then take ten times as long and more:
+    one thread waits for nobody.
+    """
+    passive = os.environ.get("OMP_WAIT_POLICY", "").lower() == "passive"
+    return cores() if passive else 1
+
+
 def gather(values: Tensor) -> Tensor:
     """Return the rows [B, ...] of all ranks as one tensor [R*B, ...]."""
     if size() == 1:

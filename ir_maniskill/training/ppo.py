@@ -1,18 +1,30 @@
 """Proximal policy optimization (Schulman et al., 2017)."""
 
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ir_maniskill.agent.agent import Agent
+from ir_maniskill.agent.agent import Agent, StateSpec
+from ir_maniskill.environment.state import State
 from ir_maniskill.training import distributed
-from ir_maniskill.training.config import PPOConfig
+from ir_maniskill.training.algorithm import (
+    Algorithm,
+    Outcome,
+    averages,
+    copied,
+    load_averages,
+    under,
+)
+from ir_maniskill.training.config import PPOConfig, TrainConfig
 from ir_maniskill.training.finite import check_finite
-from ir_maniskill.training.rollout import Batch, Rollout
+from ir_maniskill.training.rollout import Batch, RewardScale, Rollout
+from ir_maniskill.training.schedules import Curriculum, Linear
 
+VALUE_WEIGHT = 0.5
+"""Weight of the critic's loss."""
 DECIMETER = 0.1
 """Unit of the auxiliary loss [m]: about the spacing of the objects."""
 RATE_CHANGE = 1.5
@@ -21,7 +33,109 @@ LOWEST_RATE, HIGHEST_RATE = 1e-5, 1e-3
 """Up to which the step size shrinks and grows."""
 
 
-def update(
+class PPO(Algorithm):
+    """Collects T steps of all envs, then makes some epochs of gradients on them.
+
+    Noise and curriculum change from one roll-out to the next, not within one.
+    """
+
+    def __init__(self, config: TrainConfig, state: State, actions: int) -> None:
+        """Make an untrained agent, the same on all ranks."""
+        self.config = config.ppo
+        spec = StateSpec.of(state, actions)
+        self.agent = Agent(config.agent, spec).to(state["instruction"].device)
+        distributed.copy_from_first(self.agent)
+        rate = config.ppo.learning_rate
+        self.optimizer = torch.optim.Adam(self.agent.parameters(), rate, eps=1e-5)
+        self.rollout = Rollout(config.steps_per_env, state, actions)
+        self.reward_scale = RewardScale(self.rollout.num_envs, config.ppo.gamma)
+        self.noise = Linear(config.ppo.std, config.ppo.std_final)
+        self.curriculum = Curriculum(config.reward_weights, config.penalty_warmup)
+        self._t = 0  # steps of the present roll-out
+
+    @torch.no_grad()
+    def act(self, state: State) -> Tensor:
+        """Sample actions [N, A], and keep what was done in which state."""
+        if self._t == 0:
+            self._begin(state)
+        act = self.agent.act(state)
+        self.rollout.add(self._t, state, act)
+        return act.action.clamp(-1, 1)
+
+    def _begin(self, state: State) -> None:
+        """Begin a roll-out: schedules take their values for all of it."""
+        self.agent.actor.set_std(self.noise(self.share))
+        self._weights = self.curriculum.at(self.share).vector()
+        self._penalty = self.curriculum.penalty(self.share)
+        self.rollout.begin(state)
+
+    @torch.no_grad()
+    def observe(self, outcome: Outcome) -> None:
+        """Keep the reward, and the value of what truncation hides."""
+        reward, beyond = outcome.reward, torch.zeros_like(outcome.reward)
+        if outcome.terms is not None:
+            reward = outcome.terms @ self._weights.to(reward.device)
+        if self.config.bootstrap and outcome.final is not None:
+            hidden = outcome.truncated & ~outcome.terminated
+            beyond = values_of(self.agent, outcome.final, hidden)
+            check_finite({"value": beyond}, "critic", "the learning rate is too high")
+        self.rollout.add_outcome(self._t, reward, outcome.done, beyond)
+        self._next = outcome.state
+        self._t += 1
+
+    def update(self) -> dict[str, float]:
+        """Improve the agent once the roll-out is full."""
+        if self._t < self.rollout.steps:
+            return {}
+        self._t, rollout, config = 0, self.rollout, self.config
+        learned_from = distributed.gather(rollout.reward.mean()[None])  # [R]
+        # Rewards are scaled such that returns deviate by 1, whatever the task pays.
+        rollout.reward = self.reward_scale(rollout.reward, rollout.done)
+        with torch.no_grad():
+            last_value = self.agent.value(self._next)
+        rollout.finish(last_value, config.gamma, config.gae_lambda)
+        figures = improve(self.agent, self.optimizer, rollout, config)
+        if "privileged" in rollout.state:
+            seen = distributed.gather(rollout.state["privileged"].flatten(0, 1))
+            self.agent.observe(seen)
+        figures = {f"loss/{name}": value for name, value in figures.items()}
+        figures["reward"] = float(learned_from.mean())
+        figures["penalty"] = self._penalty
+        figures["std"] = float(self.agent.actor.log_std.exp().mean())
+        return figures
+
+    def restart(self) -> None:
+        """Forget the returns so far: every env begins a new episode."""
+        self.reward_scale.restart()
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the agent, the optimizer's averages, its step size, the scale."""
+        rate = self.optimizer.param_groups[0]["lr"]
+        return {
+            **copied("agent", self.agent.state_dict()),
+            **copied("optimizer", averages(self.optimizer)),
+            "learning_rate": torch.tensor(rate, dtype=torch.float64),
+            "reward_scale": self.reward_scale.state(),
+        }
+
+    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
+        """Go on from what `state_dict` returned."""
+        self.agent.load_state_dict(under("agent", tensors))
+        load_averages(self.optimizer, under("optimizer", tensors))
+        for group in self.optimizer.param_groups:
+            group["lr"] = float(tensors["learning_rate"])
+        self.reward_scale.load_state(tensors["reward_scale"])
+
+
+def values_of(agent: Agent, state: State, chosen: Tensor) -> Tensor:
+    """Return the value of the chosen states [N], and 0 for the others."""
+    values = torch.zeros(len(chosen), device=chosen.device)
+    if chosen.any():
+        values[chosen] = agent.value({k: v[chosen] for k, v in state.items()})
+    return values
+
+
+def improve(
     agent: Agent, optimizer: torch.optim.Optimizer, rollout: Rollout, config: PPOConfig
 ) -> dict[str, float]:
     """Improve the agent on the roll-outs; return the figures of the last epoch."""
@@ -95,10 +209,8 @@ def ppo_loss(
     terms = {
         "policy": -torch.minimum(ratio * advantage, clipped * advantage).mean(),
         "value": 0.5 * functional.mse_loss(now.value, batch.returns),
-        "entropy": now.entropy.mean(),
     }
-    loss = terms["policy"] + config.value_weight * terms["value"]
-    loss = loss - config.entropy_weight * terms["entropy"]
+    loss = terms["policy"] + VALUE_WEIGHT * terms["value"]
     if now.named_position is not None:
         guess, truth = now.named_position, batch.state["named_position"]
         # The square up to 1 dm: objects that fall off the table are meters away.

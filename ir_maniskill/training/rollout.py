@@ -1,18 +1,16 @@
-"""Roll-outs: what the agent lived through, kept for one update."""
+"""Roll-outs: what the agent lived through, kept for one update.
 
-import math
-from dataclasses import astuple, dataclass
-from typing import Any
+Legend: T steps, N envs, S stacked observations, A numbers of an action, B steps drawn.
+"""
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from ir_maniskill.agent.agent import Act, Agent
-from ir_maniskill.environment.state import State, StateStack
-from ir_maniskill.environment.vector import VectorEnv
+from ir_maniskill.agent.agent import Act
+from ir_maniskill.environment.state import State
 from ir_maniskill.training import distributed
-from ir_maniskill.training.config import PPOConfig
-from ir_maniskill.training.finite import check_finite
 
 
 @dataclass
@@ -101,16 +99,16 @@ class Rollout:
         if self.frames is not None:
             self.frames.add(t, state["images"], self.done[t - 1])
 
-    def add_outcome(self, t: int, reward: Tensor, done: Tensor, cut: Tensor) -> None:
+    def add_outcome(self, t: int, reward: Tensor, done: Tensor, beyond: Tensor) -> None:
         """Keep what step t led to.
 
         Args:
             t: The step.
             reward: r_t [N].
             done: Whether the episode ended with this step [N].
-            cut: Value of what an ended episode would still have brought [N].
+            beyond: Value of the last state of an ended episode, else 0 [N].
         """
-        self.reward[t], self.done[t], self.next_value[t] = reward, done, cut
+        self.reward[t], self.done[t], self.next_value[t] = reward, done, beyond
 
     def finish(self, last_value: Tensor, gamma: float, gae_lambda: float) -> None:
         """Turn rewards and values into advantages and returns.
@@ -185,14 +183,15 @@ class RewardScale:
         """Forget the running returns: every env starts a new episode."""
         self.running = torch.zeros_like(self.running)
 
-    def state_dict(self) -> dict[str, float]:
-        """Return what has to survive a restart of the program."""
-        return {"count": self.count, "mean": self.mean, "variance": self.variance}
+    def state(self) -> Tensor:
+        """Return what has to survive a restart of the program [3]."""
+        numbers = (self.count, self.mean, self.variance)
+        return torch.tensor(numbers, dtype=torch.float64)
 
-    def load_state_dict(self, state: dict[str, float]) -> None:
-        """Go on from what `state_dict` returned."""
-        self.count = int(state["count"])
-        self.mean, self.variance = float(state["mean"]), float(state["variance"])
+    def load_state(self, state: Tensor) -> None:
+        """Go on from what `state` returned."""
+        count, self.mean, self.variance = state.tolist()
+        self.count = int(count)
 
     def _update(self, returns: Tensor) -> None:
         count, total = len(returns), self.count + len(returns)
@@ -203,99 +202,3 @@ class RewardScale:
         self.variance = spread / total if spread > 0 else 1.0
         self.mean += shift * count / total
         self.count = total
-
-
-@dataclass
-class EpisodeSums:
-    """Counts over the collected steps, for the log."""
-
-    steps: int = 0
-    """Steps, over all envs."""
-    episodes: int = 0
-    """Episodes that ended."""
-    reward: float = 0.0
-    """Sum of the rewards."""
-    success: int = 0
-    """Episodes in which the named object was touched."""
-    exclusive: int = 0
-    """Episodes in which it was, and never another."""
-    touching: int = 0
-    """Steps in which the named object was touched."""
-    wrong: int = 0
-    """Steps in which another object was touched."""
-
-    def add(self, reward: Tensor, done: Tensor, info: dict[str, Any]) -> None:
-        """Count one step of all envs."""
-        self.steps += len(done)
-        self.episodes += int(done.sum())
-        self.reward += float(reward.sum())
-        self.success += int(info["success_once"][done].sum())
-        self.exclusive += int(info["exclusive_success"][done].sum())
-        self.touching += int((info["right_fingers"] > 0).sum())
-        self.wrong += int((info["wrong_fingers"] > 0).sum())
-
-    def over_ranks(self) -> "EpisodeSums":
-        """Return the sums over the envs of all ranks."""
-        sums = torch.tensor(astuple(self), dtype=torch.float64)
-        return EpisodeSums(*distributed.gather(sums[None]).sum(dim=0).tolist())
-
-    def means(self) -> dict[str, float]:
-        """Return the figures per step and per episode; NaN of none that ended."""
-        episodes = self.episodes or math.nan
-        return {
-            "return": self.reward / episodes,
-            "reward": self.reward / self.steps,
-            "success": self.success / episodes,
-            "exclusive": self.exclusive / episodes,
-            "touching": self.touching / self.steps,
-            "wrong": self.wrong / self.steps,
-        }
-
-
-def to(state: State, device: torch.device) -> State:
-    """Return the state on the learner's device."""
-    return {key: value.to(device) for key, value in state.items()}
-
-
-@torch.no_grad()
-def collect(
-    envs: VectorEnv,
-    stack: StateStack,
-    state: State,
-    agent: Agent,
-    rollout: Rollout,
-    config: PPOConfig,
-) -> tuple[State, EpisodeSums]:
-    """Fill the roll-out with T steps of all envs.
-
-    Returns:
-        The state to go on from, and the sums for the log.
-    """
-    device = state["instruction"].device
-    sums = EpisodeSums()
-    rollout.begin(state)
-    for t in range(rollout.steps):
-        check_finite(state, "observation", "the simulation became unstable")
-        act = agent.act(state)
-        rollout.add(t, state, act)
-        action = act.action.clamp(-1, 1).to(envs.device)
-        obs, reward, terminated, truncated, info = envs.step(action)
-        done, cut = terminated | truncated, torch.zeros_like(act.value)
-        if config.bootstrap and truncated.any():
-            final = to(stack.peek(info["final_observation"]), device)
-            cut = values_of(agent, final, truncated & ~terminated)
-        outcome = {"reward": reward.to(device), "value of the last observation": cut}
-        check_finite(outcome, "outcome", "the simulation became unstable")
-        rollout.add_outcome(t, reward, done, cut)
-        sums.add(reward, done, info.get("final_info", info))
-        state = to(stack.push(obs, done), device)
-    return state, sums
-
-
-def values_of(agent: Agent, state: State, chosen: Tensor) -> Tensor:
-    """Return the value of the chosen states [N], and 0 for the others."""
-    chosen = chosen.to(state["instruction"].device)
-    values = torch.zeros(len(chosen), device=chosen.device)
-    if chosen.any():
-        values[chosen] = agent.value({k: v[chosen] for k, v in state.items()})
-    return values

@@ -4,24 +4,23 @@ import contextlib
 import csv
 import fcntl
 import io
+import json
 import logging
 import os
-import shutil
 import signal
 import threading
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from torch.utils.tensorboard import SummaryWriter
 
+from ir_maniskill.checks import ConfigError
 from ir_maniskill.training import checkpoint
 from ir_maniskill.training.checkpoint import CheckpointError, Stored
-from ir_maniskill.training.config import TrainConfig, to_json
+from ir_maniskill.training.config import TrainConfig, from_data, to_json
 
 log = logging.getLogger(__name__)
-
-SPARE_BYTES = 200_000_000
-"""Room a run asks for before it starts [byte]: checkpoints and logs."""
 
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """What asks a training to stop."""
@@ -31,53 +30,76 @@ class RunFolder:
     """`config.json`, `metrics.csv`, `evaluations.csv`, TensorBoard events, policies."""
 
     def __init__(self, path: Path, *, resume: bool) -> None:
-        """Make or enter the folder.
+        """Make or enter the folder, and hold it until `close`.
 
         Raises:
-            CheckpointError: If it holds a run that would be overwritten, cannot be
-                written to, or its disk is nearly full.
+            CheckpointError: If another training is using it, it holds a run that would
+                be overwritten, or it cannot be written to.
         """
         self.path = path
         self.last = path / "last.safetensors"
         """The newest complete checkpoint."""
         self.best = path / "best.safetensors"
         """The policy with the best evaluation so far."""
+        self._lock: int | None = None
+        self._events: SummaryWriter | None = None
+        self._enter()
         if self.last.exists() and not resume:
+            self.close()
             raise CheckpointError(
                 f"{path} already holds a run: resume it, or choose another folder"
             )
-        self._require_room()
-        self._reserve = path / ".reserve.tmp"
-        self._lock: int | None = None
-        self._events: SummaryWriter | None = None
 
-    def _require_room(self) -> None:
+    def _enter(self) -> None:
+        """Take the folder for this process alone, and see that it can be written to."""
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             probe = self.path / ".probe"
             probe.write_bytes(b"0")
             probe.unlink()
+            folder = os.open(self.path, os.O_RDONLY)
         except OSError as error:
             raise CheckpointError(
                 f"cannot write to {self.path}: {error.strerror}; choose another folder"
             ) from error
-        free = shutil.disk_usage(self.path).free
-        if free < SPARE_BYTES:
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(folder)
             raise CheckpointError(
-                f"{self.path}: got {free / 1e6:.0f} MB of free space, expected "
-                f"{SPARE_BYTES / 1e6:.0f} MB; free some, or choose another folder"
+                f"{self.path} is in use by another training; wait until it ends, or "
+                "choose another folder"
+            ) from None
+        except OSError:
+            log.warning("%s: cannot be locked; train there only once", self.path)
+        self._lock = folder
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what other ranks get: the places, but no hold on the folder."""
+        return {**vars(self), "_lock": None, "_events": None}
+
+    def read_last(self) -> Stored | None:
+        """Return the last checkpoint, if there is one.
+
+        Raises:
+            CheckpointError: If it is broken, or no complete checkpoint.
+        """
+        if not self.last.exists():
+            return None
+        stored = checkpoint.read(self.last)
+        if stored.kind != checkpoint.CHECKPOINT:
+            raise CheckpointError(
+                f"{self.last}: got a policy, expected a complete checkpoint to resume "
+                "from"
             )
+        return stored
 
     def begin(self, config: TrainConfig, steps: int) -> int:
         """Write the config, and drop records of steps that will be made again.
 
         Returns:
             The steps of the last evaluation recorded; 0 if there is none.
-
-        Raises:
-            CheckpointError: If another training is using the folder.
         """
-        self._take()
         for leftover in self.path.glob(".*.tmp"):  # of a process that was killed
             leftover.unlink()
         self._events = SummaryWriter(str(self.path), purge_step=steps + 1)
@@ -95,34 +117,13 @@ class RunFolder:
         checkpoint.replace(table, _format(rows, header=True))
         return int(rows[-1]["steps"]) if rows else 0
 
-    def _take(self) -> None:
-        """Hold the folder until this process ends or calls `close`."""
-        folder = os.open(self.path, os.O_RDONLY)
-        try:
-            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(folder)
-            raise CheckpointError(
-                f"{self.path} is in use by another training; wait until it ends, or "
-                "choose another folder"
-            ) from None
-        except OSError:
-            log.warning("%s: cannot be locked; train there only once", self.path)
-        self._lock = folder
-
     def save(self, snapshot: Stored) -> None:
-        """Write the newest checkpoint, and reserve room for the next one."""
+        """Write the newest checkpoint in place of the one before."""
         checkpoint.write(self.last, snapshot)
-        size = self.last.stat().st_size
-        if snapshot.metadata["steps"] == 0:
-            size *= 3  # the optimizer's two averages are still to come
-        with contextlib.suppress(OSError), self._reserve.open("ab") as file:
-            os.posix_fallocate(file.fileno(), 0, size + 2**20)
 
     def save_at_last(self, snapshot: Stored) -> None:
-        """Write the checkpoint of a run that has to stop, on a full disk too."""
+        """Write the checkpoint of a run that has to stop."""
         with _undisturbed():
-            self._reserve.unlink(missing_ok=True)
             checkpoint.write(self.last, snapshot)
         log.warning(
             "stopped at step %d: resume goes on there", snapshot.metadata["steps"]
@@ -144,7 +145,6 @@ class RunFolder:
             with contextlib.suppress(OSError):  # the tables have all that they have
                 self._events.close()
         if self._lock is not None:
-            self._reserve.unlink(missing_ok=True)
             os.close(self._lock)
             self._lock = None
 
@@ -161,6 +161,21 @@ def _undisturbed() -> Iterator[None]:
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)
+
+
+def stored_config(folder: Path) -> TrainConfig | None:
+    """Return the config of the run in a folder; None if there is no run.
+
+    Raises:
+        ConfigError: If it is none.
+    """
+    path = folder / "config.json"
+    if not path.exists():
+        return None
+    try:
+        return from_data(json.loads(path.read_text()))
+    except ValueError as error:  # also of what is no JSON
+        raise ConfigError(f"{path}: {error}") from error
 
 
 def whole_rows(table: Path) -> list[dict[str, str]]:

@@ -1,0 +1,416 @@
+"""The runner: steps the envs, evaluates, keeps checkpoints, shows how it goes.
+
+It knows nothing of how the algorithm learns. Legend: N envs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import astuple, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from ir_maniskill.agent.agent import Agent
+from ir_maniskill.environment.state import State, StateStack
+from ir_maniskill.environment.vector import VectorEnv
+from ir_maniskill.evaluation.evaluate import EvaluationReport, evaluate_policy
+from ir_maniskill.training import checkpoint, distributed
+from ir_maniskill.training.algorithm import Algorithm, Outcome
+from ir_maniskill.training.checkpoint import CheckpointError, Stored
+from ir_maniskill.training.config import TrainConfig
+from ir_maniskill.training.finite import TrainingDivergedError, check_finite
+from ir_maniskill.training.run_folder import RunFolder
+
+EVAL_SEED, FINAL_SEED = 1_000_000, 1_050_000
+"""Seeds of the episodes that choose the best policy, and of those that judge it in the
+end; those of training are from 2**30 on."""
+
+FINAL_EPISODES = 100
+"""Episodes of the last evaluation, of the policy that is kept; one for each sentence
+if those are more."""
+
+Figures = dict[str, float]
+
+
+class Runner:
+    """One run: the algorithm, its envs, and how far it has come.
+
+    Scenes are reseeded from (seed, steps) at the start and after every checkpoint, so
+    that a run resumed there meets the same scenes as one that was never interrupted.
+    An evaluation has envs of its own and changes nothing. Several ranks have the scenes
+    of one with all envs. The first one's random states are in the checkpoint; the
+    others draw anew from (seed, steps, rank) after it.
+    """
+
+    newest: Stored
+    """Snapshot after the last complete update."""
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        folder: RunFolder,
+        envs: VectorEnv,
+        eval_envs: Callable[[], VectorEnv],
+        algorithm: type[Algorithm],
+    ) -> None:
+        """Make what is still untrained.
+
+        Args:
+            config: All numbers, with the senses and the vocabulary of the experiment.
+            folder: Where to keep what comes of it.
+            envs: This rank's share of the envs.
+            eval_envs: Returns the envs to evaluate in, always the same ones.
+            algorithm: What learns.
+        """
+        self.config, self.folder, self.envs = config, folder, envs
+        self.eval_envs = eval_envs
+        self.device = distributed.device()
+        self.stack, self.counts = StateStack(config.frames), StepCounts()
+        self.steps, self.saved, self.evaluated = 0, 0, 0
+        self.best_score = -math.inf
+        torch.manual_seed(config.seed)
+        torch.set_num_threads(1)  # orthogonal weights depend on it in their last bits
+        self.state = self._new_scenes()
+        actions = math.prod(envs.single_action_space.shape or ())
+        self.algorithm = algorithm(config, self.state, actions)
+        self.said = ""  # of the last evaluation, for the progress bar
+
+    # -- The loop --------------------------------------------------------------------
+
+    def learn(self) -> None:
+        """Train until the steps are used up, rounded up to the next update."""
+        total = self.config.total_steps
+        self.evaluated = distributed.from_first(
+            lambda: self.folder.begin(self.config, self.steps)
+        )
+        self.newest = self.snapshot()
+        self._write()  # shows at once that we can
+        silent = distributed.rank() > 0
+        bar = tqdm(total=total, initial=self.steps, unit=" steps", disable=silent)
+        with bar, self._kept_at_last():
+            while True:
+                if self._evaluation_is_due():
+                    self.evaluate()
+                if self._due(self.config.checkpoint_interval, self.saved):
+                    self.save()
+                if self.steps >= total:
+                    break
+                figures = self.advance()
+                self.newest = self.snapshot()
+                bar.set_postfix_str(_summary(figures) + self.said)
+                bar.update(self.steps - bar.n)
+            self._write()
+        distributed.from_first(self.confirm)
+
+    def advance(self) -> Figures:
+        """Step the envs until the algorithm has learned something."""
+        figures: Figures = {}
+        seconds = {"collect": 0.0, "update": 0.0}
+        while not figures:
+            started = time.perf_counter()
+            self.step()
+            stepped = time.perf_counter()
+            with threads(self.config.threads or distributed.threads()):
+                figures = self.algorithm.update()
+            seconds["collect"] += stepped - started
+            seconds["update"] += time.perf_counter() - stepped
+        counts, self.counts = self.counts.over_ranks(), StepCounts()
+        figures = {f"train/{k}": v for k, v in counts.means().items()} | figures
+        figures |= {f"time/{name}": value for name, value in seconds.items()}  # [s]
+        if distributed.rank() == 0:
+            self.folder.log("metrics", self.steps, figures)
+        return figures
+
+    def step(self) -> None:
+        """Let the algorithm act in all envs, and show it what that led to."""
+        check_finite(self.state, "observation", "the simulation became unstable")
+        self.algorithm.share = min(self.steps / self.config.total_steps, 1.0)
+        with threads(1):  # the cores belong to the simulator's workers
+            action = self.algorithm.act(self.state)
+            obs, reward, terminated, truncated, info = self.envs.step(
+                action.to(self.envs.device)
+            )
+            done, final = terminated | truncated, None
+            if "final_info" in info:
+                final = self._here(self.stack.peek(info["final_observation"]))
+            info = info_of_step(info, done)
+            self.state = self._here(self.stack.push(obs, done))
+            self.counts.add(reward, done, info)
+            terms = info.get("reward_terms")
+            measured = {"reward": reward} if terms is None else {"reward terms": terms}
+            check_finite(measured, "outcome", "the simulation became unstable")
+            self.algorithm.observe(
+                Outcome(
+                    reward=reward.to(self.device),
+                    terms=None if terms is None else terms.to(self.device),
+                    terminated=terminated.to(self.device),
+                    truncated=truncated.to(self.device),
+                    state=self.state,
+                    final=final,
+                )
+            )
+        self.steps += self.config.num_envs
+
+    def _here(self, state: State) -> State:
+        """Return the state on the learner's device."""
+        return {key: value.to(self.device) for key, value in state.items()}
+
+    def _new_scenes(self) -> State:
+        """Start new episodes whose scenes follow from (seed, steps) alone."""
+        rank = distributed.rank()
+        if rank > 0:
+            torch.manual_seed(_entropy(self.config.seed, self.steps, rank))
+        # A quarter of the seeds, beyond those of evaluations.
+        seed = 2**30 + _entropy(self.config.seed, self.steps) % 2**29
+        obs, _ = self.envs.reset(seed=seed + rank * self.envs.num_envs)
+        self.counts = StepCounts()
+        return self._here(self.stack.reset(obs))
+
+    # -- Evaluation ------------------------------------------------------------------
+
+    def evaluate(self) -> None:
+        """Evaluate the policy on pinned scenes; keep it if it is the best so far."""
+        figures = distributed.from_first(self._evaluate)
+        self.newest = self.snapshot()  # the best score may be new
+        if distributed.rank() == 0:  # at last: what has no record is made again
+            self.folder.log("evaluations", self.steps, figures)
+        self.evaluated = self.steps
+        self.said = _said(self.steps, figures)
+
+    def _evaluate(self) -> Figures:
+        report = self._report(
+            self.algorithm.agent, self.config.eval_episodes, EVAL_SEED
+        )
+        score = score_of(report, fingers=self.state["touch"].shape[2])
+        if score > self.best_score:
+            self.best_score = score
+            self._keep(self.algorithm.agent, self.steps, report)
+        return figures_of(report)
+
+    def confirm(self) -> None:
+        """Evaluate the best policy on other scenes than those it was chosen by."""
+        agent, _, metadata = checkpoint.load_policy(self.folder.best)
+        sentences = len(self.envs.experiment.sentences)
+        episodes = max(FINAL_EPISODES, sentences)
+        report = self._report(agent.to(self.device), episodes, FINAL_SEED)
+        figures = self._keep(agent, metadata["steps"], report)
+        text = json.dumps(figures, indent=2)
+        path = self.folder.path / "evaluation.json"
+        checkpoint.replace(path, (text + "\n").encode())
+
+    def _report(self, agent: Agent, episodes: int, seed: int) -> EvaluationReport:
+        """Evaluate an agent without touching what training goes on with."""
+        random = checkpoint.random_state()
+        report = evaluate_policy(
+            agent.policy,
+            self.config.env_id,
+            episodes=episodes,
+            seed=seed,
+            frames=self.config.frames,
+            envs=self.eval_envs(),
+        )
+        checkpoint.set_random_state(*random)
+        return report
+
+    def _keep(
+        self, agent: Agent, steps: int, report: EvaluationReport
+    ) -> dict[str, Any]:
+        """Write the policy as the best one, with its figures, and return these."""
+        path, config, figures = self.folder.best, self.config, report.as_dict()
+        checkpoint.save_policy(path, agent, config, steps=steps, evaluation=figures)
+        return figures
+
+    def _evaluation_is_due(self) -> bool:
+        """Whether a multiple of the interval, or the end, is not evaluated yet."""
+        ended = self.steps >= self.config.total_steps and self.steps > self.evaluated
+        return ended or self._due(self.config.eval_interval, self.evaluated)
+
+    def _due(self, interval: int, before: int) -> bool:
+        """Whether a multiple of the interval was passed since that many steps."""
+        return self.steps // interval > before // interval
+
+    # -- Checkpoints -----------------------------------------------------------------
+
+    def snapshot(self) -> Stored:
+        """Return everything the run needs to go on, as of now."""
+        tensors, plain = checkpoint.random_state()
+        facts = {"steps": self.steps, "best_score": self.best_score, "random": plain}
+        metadata = checkpoint.describe(self.algorithm.agent, self.config, **facts)
+        tensors |= self.algorithm.state_dict()
+        return Stored(checkpoint.CHECKPOINT, tensors, metadata)
+
+    def save(self) -> None:
+        """Write a checkpoint, and go on with new scenes as a resumed run would."""
+        self._write()
+        self.saved = self.steps
+        self.state = self._new_scenes()
+        self.algorithm.restart()
+
+    def _write(self) -> None:
+        """Write the first rank's newest snapshot as the last checkpoint."""
+        distributed.from_first(lambda: self.folder.save(self.newest))
+
+    @contextlib.contextmanager
+    def _kept_at_last(self) -> Iterator[None]:
+        """Leave the newest snapshot as the last checkpoint, whatever stops it."""
+        try:
+            yield
+        except BaseException as error:
+            diverged = isinstance(error, TrainingDivergedError)
+            # Where it diverged, the older checkpoint is the good one.
+            if distributed.rank() == 0 and not diverged:
+                self.folder.save_at_last(self.newest)
+            raise
+
+    def restore(self, stored: Stored) -> None:
+        """Go on from a checkpoint.
+
+        Raises:
+            CheckpointError: If it does not fit the algorithm.
+        """
+        try:
+            self.algorithm.load_state_dict(stored.tensors)
+            checkpoint.set_random_state(stored.tensors, stored.metadata["random"])
+            self.best_score = float(stored.metadata["best_score"])
+            self.steps = self.saved = _whole_steps(stored.metadata["steps"])
+        except checkpoint.MALFORMED as error:
+            raise CheckpointError(
+                f"{self.folder.last} does not fit this agent: {error}; train anew in "
+                "another folder"
+            ) from error
+        self.state = self._new_scenes()
+        self.algorithm.restart()
+
+
+# -- Counting --------------------------------------------------------------------------
+
+
+def info_of_step(info: dict[str, Any], done: Tensor) -> dict[str, Tensor]:
+    """Return what was measured after the step, also where a new episode has begun.
+
+    Rows of `final_info` whose episode goes on are stale: those of `info` count.
+    """
+    if "final_info" not in info:
+        return info
+    final, merged = info["final_info"], {}
+    for name, value in final.items():
+        if isinstance(value, Tensor) and isinstance(info.get(name), Tensor):
+            rows = done.view(-1, *[1] * (value.ndim - 1))
+            merged[name] = torch.where(rows, value, info[name])
+    return merged
+
+
+@dataclass
+class StepCounts:
+    """Counts over the steps made, for the log."""
+
+    steps: int = 0
+    """Steps, over all envs."""
+    episodes: int = 0
+    """Episodes that ended."""
+    reward: float = 0.0
+    """Sum of the env's rewards."""
+    success: int = 0
+    """Ended episodes in which the goal was reached."""
+    exclusive: int = 0
+    """Ended episodes in which it was, and without a foul."""
+    touching: int = 0
+    """Steps with a finger where it should be."""
+    wrong: int = 0
+    """Steps with a finger where it should not."""
+
+    def add(self, reward: Tensor, done: Tensor, info: dict[str, Tensor]) -> None:
+        """Count one step of all envs."""
+        self.steps += len(done)
+        self.episodes += int(done.sum())
+        self.reward += float(reward.sum())
+        self.success += int(info["success_once"][done].sum())
+        self.exclusive += int(info["exclusive_success"][done].sum())
+        self.touching += int((info["right_fingers"] > 0).sum())
+        self.wrong += int((info["wrong_fingers"] > 0).sum())
+
+    def over_ranks(self) -> StepCounts:
+        """Return the sums over the envs of all ranks."""
+        sums = torch.tensor(astuple(self), dtype=torch.float64)
+        return StepCounts(*distributed.gather(sums[None]).sum(dim=0).tolist())
+
+    def means(self) -> Figures:
+        """Return the figures per step and per episode; NaN of none that ended."""
+        episodes = self.episodes or math.nan
+        return {
+            "return": self.reward / episodes,
+            "reward": self.reward / self.steps,
+            "success": self.success / episodes,
+            "exclusive": self.exclusive / episodes,
+            "touching": self.touching / self.steps,
+            "wrong": self.wrong / self.steps,
+        }
+
+
+def score_of(report: EvaluationReport, fingers: int) -> float:
+    """Return by what the best policy is chosen.
+
+    That is the sum of the worst sentence's success, the exclusive success, the share of
+    steps in touch, and that of all fingers which are where they should be.
+    """
+    figures = figures_of(report)
+    held = figures["eval/touching"] + figures["eval/right_fingers"] / fingers
+    return figures["eval/worst"] + figures["eval/exclusive"] + held
+
+
+def figures_of(report: EvaluationReport) -> Figures:
+    """Return the figures of an evaluation that are worth a curve."""
+    names = ("success", "exclusive", "touching", "right_fingers", "wrong_fingers")
+    overall = report.overall.as_dict()
+    worst = min(score.success.value for score in report.instructions.values())
+    return {"eval/worst": worst} | {f"eval/{name}": overall[name] for name in names}
+
+
+def _summary(figures: Figures) -> str:
+    """Return what the progress bar says of the last update."""
+    reward, success = figures["train/return"], figures["train/success"]
+    told = [f"return {reward:.2f}", f"success {success:.0%}"]
+    if "penalty" in figures:
+        told.append(f"penalties {figures['penalty']:.0%}")
+    if "std" in figures:
+        told.append(f"noise {figures['std']:.2f}")
+    return ", ".join(told)
+
+
+def _said(steps: int, figures: Figures) -> str:
+    """Return what the progress bar says of the last evaluation."""
+    names = ("success", "exclusive", "touching")
+    shares = ", ".join(f"{name} {figures[f'eval/{name}']:.0%}" for name in names)
+    fingers = figures["eval/right_fingers"]
+    return f" | policy at {steps}: {shares}, {fingers:.1f} fingers"
+
+
+@contextlib.contextmanager
+def threads(count: int) -> Iterator[None]:
+    """Let torch compute with that many threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _whole_steps(got: object) -> int:
+    """Return the step count of a checkpoint."""
+    if type(got) is not int or got < 0:
+        raise ValueError(f"steps: got {got!r}, expected a whole number")
+    return got
+
+
+def _entropy(*numbers: int) -> int:
+    """Return a seed that mixes the numbers."""
+    return int(np.random.SeedSequence(numbers).generate_state(1)[0])
