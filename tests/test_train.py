@@ -97,9 +97,9 @@ def test_training_learns_the_toy_task_and_keeps_the_best_policy(tmp_path):
 
 
 def test_the_best_policy_reaches_the_goal_and_holds_it_with_many_fingers():
-    def score(success, touching, fingers):
+    def score(success, holding, fingers):
         rates = {"success": Rate(success, 4), "exclusive": Rate(4, 4)}
-        means = {"touching": touching, "right_fingers": fingers}
+        means = {"holding": holding, "right_fingers": fingers}
         each = Score(**rates, **means, wrong_fingers=0, mean_return=0)
         report = EvaluationReport("T-v1", 0, 4, dict.fromkeys(SENTENCES, each), each)
         return runner.score_of(report, fingers=2)
@@ -412,7 +412,8 @@ def test_what_final_infos_say_of_episodes_that_go_on_does_not_count():
     def info(first, second):
         values = torch.tensor([first, second])
         fingers = {"right_fingers": values, "wrong_fingers": 0 * values}
-        once = {"success_once": values > 0, "exclusive_success": values > 0}
+        names = ("success", "success_once", "exclusive_success")
+        once = {name: values > 0 for name in names}
         return {**fingers, **once, "reward_terms": values[:, None]}
 
     done, counts = torch.tensor([True, False]), runner.StepCounts()
@@ -420,14 +421,14 @@ def test_what_final_infos_say_of_episodes_that_go_on_does_not_count():
     merged = runner.info_of_step(stale, done)
     assert merged["right_fingers"].tolist() == [1, 1]
     assert merged["reward_terms"].tolist() == [[1], [1]]
-    stale["right_fingers"][1], stale["success_once"][1] = 0, False
+    stale["success"][1] = stale["success_once"][1] = False
     counts.add(torch.zeros(2), done, runner.info_of_step(stale, done))
-    assert (counts.touching, counts.success, counts.episodes) == (1, 1, 1)
+    assert (counts.holding, counts.success, counts.episodes) == (1, 1, 1)
 
 
 def test_where_no_episode_ended_there_are_no_figures_of_episodes():
-    means = runner.StepCounts(steps=4, reward=2.0, touching=1).means()
-    assert (means["reward"], means["touching"]) == (0.5, 0.25)
+    means = runner.StepCounts(steps=4, reward=2.0, holding=1).means()
+    assert (means["reward"], means["holding"]) == (0.5, 0.25)
     assert all(math.isnan(means[name]) for name in ("return", "success", "exclusive"))
 
 

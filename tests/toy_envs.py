@@ -72,6 +72,7 @@ class ToyVectorEnv:
         info = {
             "right_fingers": right.long(),
             "wrong_fingers": torch.zeros_like(self.told),
+            "success": right,
             "success_once": self.touched.clone(),
             "exclusive_success": self.touched.clone(),
         }

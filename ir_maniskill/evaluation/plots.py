@@ -17,9 +17,9 @@ from matplotlib.figure import Figure
 from ir_maniskill.training.run_folder import whole_rows
 
 TRAINING = (
-    ("train/success", "episodes touching the named object"),
+    ("train/success", "episodes that reach the goal"),
     ("train/exclusive", "and nothing else"),
-    ("train/touching", "steps touching it"),
+    ("train/holding", "steps in which it holds"),
 )
 """Columns of metrics.csv that are shares, and what the legend calls them."""
 COLORS = ("#2f6fde", "#22a06b", "#9aa3b2")

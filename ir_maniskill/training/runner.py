@@ -207,7 +207,7 @@ class Runner:
         checkpoint.replace(path, (text + "\n").encode())
 
     def _report(self, agent: Agent, episodes: int, seed: int) -> EvaluationReport:
-        """Evaluate an agent without touching what training goes on with."""
+        """Evaluate an agent without holding what training goes on with."""
         random = checkpoint.random_state()
         report = evaluate_policy(
             agent.policy,
@@ -322,10 +322,10 @@ class StepCounts:
     """Ended episodes in which the goal was reached."""
     exclusive: int = 0
     """Ended episodes in which it was, and without a foul."""
-    touching: int = 0
-    """Steps with a finger where it should be."""
+    holding: int = 0
+    """Steps in which the goal held."""
     wrong: int = 0
-    """Steps with a finger where it should not."""
+    """Steps with a finger where the goal does not allow it."""
 
     def add(self, reward: Tensor, done: Tensor, info: dict[str, Tensor]) -> None:
         """Count one step of all envs."""
@@ -334,7 +334,7 @@ class StepCounts:
         self.reward += float(reward.sum())
         self.success += int(info["success_once"][done].sum())
         self.exclusive += int(info["exclusive_success"][done].sum())
-        self.touching += int((info["right_fingers"] > 0).sum())
+        self.holding += int(info["success"].sum())
         self.wrong += int((info["wrong_fingers"] > 0).sum())
 
     def over_ranks(self) -> StepCounts:
@@ -350,7 +350,7 @@ class StepCounts:
             "reward": self.reward / self.steps,
             "success": self.success / episodes,
             "exclusive": self.exclusive / episodes,
-            "touching": self.touching / self.steps,
+            "holding": self.holding / self.steps,
             "wrong": self.wrong / self.steps,
         }
 
@@ -359,16 +359,16 @@ def score_of(report: EvaluationReport, fingers: int) -> float:
     """Return by what the best policy is chosen.
 
     That is the sum of the worst sentence's success, the exclusive success, the share of
-    steps in touch, and that of all fingers which are where they should be.
+    steps in which the goal holds, and that of the fingers which touch as it asks.
     """
     figures = figures_of(report)
-    held = figures["eval/touching"] + figures["eval/right_fingers"] / fingers
+    held = figures["eval/holding"] + figures["eval/right_fingers"] / fingers
     return figures["eval/worst"] + figures["eval/exclusive"] + held
 
 
 def figures_of(report: EvaluationReport) -> Figures:
     """Return the figures of an evaluation that are worth a curve."""
-    names = ("success", "exclusive", "touching", "right_fingers", "wrong_fingers")
+    names = ("success", "exclusive", "holding", "right_fingers", "wrong_fingers")
     overall = report.overall.as_dict()
     worst = min(score.success.value for score in report.instructions.values())
     return {"eval/worst": worst} | {f"eval/{name}": overall[name] for name in names}
@@ -387,7 +387,7 @@ def _summary(figures: Figures) -> str:
 
 def _said(steps: int, figures: Figures) -> str:
     """Return what the progress bar says of the last evaluation."""
-    names = ("success", "exclusive", "touching")
+    names = ("success", "exclusive", "holding")
     shares = ", ".join(f"{name} {figures[f'eval/{name}']:.0%}" for name in names)
     fingers = figures["eval/right_fingers"]
     return f" | policy at {steps}: {shares}, {fingers:.1f} fingers"

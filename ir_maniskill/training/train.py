@@ -7,18 +7,19 @@ import dataclasses
 import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import torch
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.agent.config import Sense
-from ir_maniskill.checks import ConfigError
+from ir_maniskill.checks import ConfigError, require
 from ir_maniskill.environment.vector import VectorEnv, make_vec
 from ir_maniskill.experiment import Experiment
 from ir_maniskill.training import distributed
 from ir_maniskill.training.algorithm import Algorithm
 from ir_maniskill.training.config import (
+    CONFIGS,
     TrainConfig,
     from_data,
     leaves,
@@ -31,11 +32,14 @@ from ir_maniskill.training.runner import Runner
 
 
 def train(
-    config: TrainConfig,
+    task: str | TrainConfig,
     resume: bool = False,
     envs: VectorEnv | None = None,
     eval_envs: VectorEnv | None = None,
     algorithm: type[Algorithm] = PPO,
+    *,
+    preset: str = "default",
+    **changes: Any,
 ) -> Path:
     """Train an agent and return the file of its best policy.
 
@@ -44,13 +48,16 @@ def train(
     Where torchrun started several processes, each trains on its share of the envs.
 
     Args:
-        config: Task, learner, budget and folder.
+        task: Id of the task, or the whole configuration of the training.
         resume: Go on from the folder's last checkpoint, if there is one, with the
-            folder's own config. Of `config` counts what differs from `TrainConfig()`;
-            it may be the budget, the intervals and what the run is computed on.
+            folder's own config. Of `changes`, or of what a configuration given has
+            other than `TrainConfig()`, the budget, the intervals and what it is
+            computed on may differ from that.
         envs: Vector of this rank's envs to use (and leave open) instead of making one.
         eval_envs: The same for evaluations, which only the first rank makes.
         algorithm: What learns.
+        preset: Which of `CONFIGS` to train a task with.
+        **changes: Fields that shall be other than in the preset, or in `task`.
 
     Raises:
         CheckpointError: If the folder or its checkpoint cannot be used.
@@ -61,10 +68,18 @@ def train(
         TrainingDivergedError: If a number stopped being finite.
         WorkerError: If a simulator process died or hangs.
     """
+    if isinstance(task, str):
+        require(preset in CONFIGS, "preset", preset, f"one of {', '.join(CONFIGS)}")
+        changes = {"env_id": task, "out": f"runs/{task}", **changes}
+        config = dataclasses.replace(CONFIGS[preset], **changes)
+    else:
+        config = dataclasses.replace(task, **changes)
     stored = stored_config(Path(config.out)) if resume else None
-    if stored is not None:
-        task = envs.experiment if envs is not None else catalog.get(stored.env_id)
-        config = resumed(stored, for_experiment(config, task))
+    if stored is not None and isinstance(task, str):
+        config = dataclasses.replace(stored, **changes)
+    elif stored is not None:
+        experiment = envs.experiment if envs else catalog.get(stored.env_id)
+        config = resumed(stored, for_experiment(config, experiment))
     return run(config, resume, envs, eval_envs, algorithm)
 
 
