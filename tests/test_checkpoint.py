@@ -1,4 +1,3 @@
-import dataclasses
 import io
 import json
 import math
@@ -12,28 +11,17 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from PIL import Image
 from toy_envs import SPEC, ToyVectorEnv, toy_config, toy_state
 
 from ir_maniskill.agent import Agent
-from ir_maniskill.environment.reward_generator import DenseWeights
 from ir_maniskill.training import checkpoint, quantize
+from ir_maniskill.training.algorithm import averages, copied
 from ir_maniskill.training.checkpoint import CheckpointError, Stored
-from ir_maniskill.training.config import (
-    CONFIGS,
-    LATER,
-    AgentConfig,
-    ConfigError,
-    PPOConfig,
-    TrainConfig,
-    decode,
-    to_json,
-)
 from ir_maniskill.training.finite import TrainingDivergedError
+from ir_maniskill.training.ppo import PPO
 from ir_maniskill.training.run_folder import RunFolder
-from ir_maniskill.training.train import Trainer
+from ir_maniskill.training.runner import Runner
 
 
 @pytest.fixture
@@ -49,168 +37,10 @@ def trained(tmp_path):
     return agent, optimizer, config
 
 
-def from_json(text):
-    return decode(TrainConfig, json.loads(text))
-
-
-@pytest.mark.parametrize("name", CONFIGS)
-def test_configs_survive_json(name):
-    assert from_json(to_json(CONFIGS[name])) == CONFIGS[name]
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"sede": 1}, "unknown: \\['sede'\\]"),
-        ({"seed": "1"}, "seed: got '1', expected a value of type int"),
-        ({"seed": True}, "seed: got True"),
-        ({"agent": 3}, "AgentConfig: got 3, expected an object"),
-        ({"num_envs": 7}, "num_envs: got 7, expected a divisor of 64"),
-        (
-            {"stop_at_success": 0.0},
-            "stop_at_success: got 0.0, expected more than 0, at most 1, or None",
-        ),
-        ({"reward_mode": "none"}, "reward_mode: got 'none'.*'dense'"),
-        ({"control_mode": "pd_ee"}, "control_mode: got 'pd_ee'.*'pd_joint_pos'"),
-        ({"eval_seed": 2**29}, "eval_seed: got 536870912, expected 0 to"),
-        (
-            {"dense_weights": dataclasses.asdict(DenseWeights()) | {"spoiled": 1.5}},
-            "dense_weights: got spoiled=1.5",
-        ),
-    ],
-)
-def test_wrong_configs_say_what_was_got_and_expected(change, message):
-    with pytest.raises(ConfigError, match=message):
-        from_json(json.dumps(json.loads(to_json(TrainConfig())) | change))
-
-
-def test_a_missing_field_is_named():
-    data = json.loads(to_json(TrainConfig()))
-    del data["ppo"]["clip"]
-    with pytest.raises(ConfigError, match=r"PPOConfig.*missing: \['clip'\]"):
-        from_json(json.dumps(data))
-
-
-def test_files_from_before_a_field_was_added_keep_their_meaning():
-    data = json.loads(to_json(TrainConfig()))
-    for field in LATER["TrainConfig"]:
-        del data[field]
-    for part, owner in (("agent", "AgentConfig"), ("dense_weights", "DenseWeights")):
-        for field in LATER[owner]:
-            del data[part][field]
-    assert from_json(json.dumps(data)) == TrainConfig()
-
-
-def replace_leaf(data, path, value):
-    """Return JSON data with another value at a path of keys."""
-    if not path:
-        return value
-    return data | {path[0]: replace_leaf(data[path[0]], path[1:], value)}
-
-
-JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
-    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
-    max_leaves=4,
-)
-FIELDS = [
-    *((f.name,) for f in dataclasses.fields(TrainConfig)),
-    *(("agent", f.name) for f in dataclasses.fields(AgentConfig)),
-    *(("ppo", f.name) for f in dataclasses.fields(PPOConfig)),
-    *(("dense_weights", f.name) for f in dataclasses.fields(DenseWeights)),
-]
-
-
-@given(st.sampled_from(FIELDS), JSON)
-def test_whatever_a_config_says_it_is_a_config_or_refused(path, value):
-    data = replace_leaf(json.loads(to_json(TrainConfig())), path, value)
-    try:
-        config = from_json(json.dumps(data))
-    except ConfigError as error:
-        assert "got" in str(error)
-        return
-    assert from_json(to_json(config)) == config
-    assert config.steps_per_update > 0
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (
-            lambda: AgentConfig(senses=("smell",)),
-            "senses: got 'smell'",
-        ),
-        (lambda: AgentConfig(vision="resnet"), "'patches', 'paper'"),
-        (lambda: AgentConfig(language_heads=3), "language_width: got 50.*3 heads"),
-        (lambda: AgentConfig(body_width=0), "body_width: got 0, expected at least 1"),
-        (lambda: TrainConfig(reward_mode="none"), "reward_mode: got 'none', expected"),
-        (lambda: AgentConfig(std=0.0), "std: got 0.0, expected more than 0"),
-        (
-            lambda: AgentConfig(posture_gain=-1.0),
-            "posture_gain: got -1.0, expected a finite number of at least 0",
-        ),
-        (
-            lambda: AgentConfig(posture_gain=1.0, senses=("vision", "touch")),
-            "posture_gain: got 1.0, expected 0 where the actor does not feel",
-        ),
-        (
-            lambda: AgentConfig(posture_gain=1.0, sees_target=False),
-            "posture_gain: got 1.0, expected 0 where the actor does not feel",
-        ),
-        (
-            lambda: TrainConfig(
-                control_mode="pd_joint_pos", agent=AgentConfig(posture_gain=1.0)
-            ),
-            "posture_gain: got 1.0, expected 0 where actions do not change",
-        ),
-        (
-            lambda: AgentConfig(posture_gain_final=2.0),
-            "posture_gain_final: got 2.0, expected .* beside a posture_gain above 0",
-        ),
-        (lambda: PPOConfig(gamma=1.1), "gamma: got 1.1, expected 0 to 1"),
-        (lambda: PPOConfig(minibatch=1), "minibatch: got 1, expected 2 to 2048"),
-        (lambda: TrainConfig(total_steps=0), "total_steps: got 0"),
-        (
-            lambda: dataclasses.replace(CONFIGS["posture"], total_steps=60_000),
-            "lenient_steps: got 80000, expected 0 to 60000, the total_steps",
-        ),
-    ],
-)
-def test_values_that_cannot_work_are_refused(make, message):
-    with pytest.raises(ConfigError, match=message):
-        make()
-
-
-def test_the_papers_numbers():
-    paper = CONFIGS["paper"]
-    assert paper.steps_per_update == 24 * 32
-    assert (paper.ppo.learning_rate, paper.ppo.epochs) == (1e-5, 60)
-    assert (paper.ppo.gae_lambda, paper.ppo.minibatch) == (1.0, None)
-    assert (paper.agent.std_mode, paper.agent.std) == ("fixed", 0.36)
-    assert paper.env_kwargs(training=True)["obs_mode"] == "rgb"
-
-
-def test_only_training_asks_for_the_simulators_state():
-    config = TrainConfig()
-    assert config.env_kwargs(training=True)["obs_mode"] == "rgb+state_dict"
-    assert config.env_kwargs(training=False)["obs_mode"] == "rgb"
-    blind = dataclasses.replace(config, agent=AgentConfig(senses=("touch",)))
-    assert blind.env_kwargs(training=False)["obs_mode"] == "state_dict"
-
-
-def test_weights_and_optimizer_come_back_bit_for_bit(trained, tmp_path):
-    agent, optimizer, config = trained
-    packed = checkpoint.pack(agent, optimizer)
-    path = tmp_path / "last.safetensors"
-    facts = checkpoint.describe(agent, config)
-    checkpoint.write(path, Stored(checkpoint.CHECKPOINT, packed, facts))
-    other = Agent(config.agent, SPEC)
-    other_optimizer = torch.optim.Adam(other.parameters(), 1e-3)
-    checkpoint.unpack(checkpoint.read(path).tensors, other, other_optimizer)
-    again = checkpoint.pack(other, other_optimizer)
-    assert again.keys() == packed.keys()
-    assert all(torch.equal(again[name], packed[name]) for name in packed)
-    assert any(name.startswith("optimizer.") for name in packed)
+def packed_of(agent, optimizer):
+    """Return the tensors of a checkpoint."""
+    weights = copied("agent", agent.state_dict())
+    return weights | copied("optimizer", averages(optimizer))
 
 
 def test_random_generators_go_on_where_they_were():
@@ -249,7 +79,7 @@ def test_a_policy_file_is_smaller_than_a_checkpoint(trained, tmp_path):
     policy = {"steps": 0, "evaluation": {}, "states": toy_state()}
     checkpoint.save_policy(small, agent, config, **policy)
     facts = checkpoint.describe(agent, config)
-    packed = checkpoint.pack(agent, optimizer)
+    packed = packed_of(agent, optimizer)
     checkpoint.write(large, Stored(checkpoint.CHECKPOINT, packed, facts))
     assert small.stat().st_size < large.stat().st_size / 6
     agent_of_checkpoint, _, _ = checkpoint.load_policy(large)
@@ -278,7 +108,7 @@ def write_both(folder, monkeypatch, agent, optimizer, config):
     policy = {"steps": 1, "evaluation": {}, "states": toy_state()}
     checkpoint.save_policy(paths[0], agent, config, **policy)
     facts = checkpoint.describe(agent, config, steps=1)
-    packed = checkpoint.pack(agent, optimizer)
+    packed = packed_of(agent, optimizer)
     checkpoint.write(paths[1], Stored(checkpoint.CHECKPOINT, packed, facts))
     return paths
 
@@ -424,16 +254,16 @@ def test_a_checkpoint_of_wrong_values_is_resumed_or_refused(tmp_path):
     config, generator = toy_config(tmp_path), random.Random(1)
     folder = RunFolder(tmp_path, resume=False)
     folder.begin(config, 0)
-    trainer = Trainer(config, ToyVectorEnv(8), folder)
-    trainer.update()
-    stored, refused = trainer.snapshot(), 0
+    runner = Runner(config, folder, ToyVectorEnv(8), lambda: ToyVectorEnv(8), PPO)
+    runner.advance()
+    stored, refused = runner.snapshot(), 0
     for _ in range(100):
         checkpoint.write(folder.last, distort(stored, generator))
         try:
-            trainer.restore()
+            runner.restore(checkpoint.read(folder.last))
         except CheckpointError:
             refused += 1
-        assert trainer.steps >= 0
+        assert runner.steps >= 0
     assert 20 < refused < 100
     folder.close()
 

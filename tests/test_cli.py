@@ -16,7 +16,9 @@ from ir_maniskill.training.config import (
     AgentConfig,
     PPOConfig,
     TrainConfig,
+    to_json,
 )
+from ir_maniskill.training.train import for_experiment
 
 IDS = [
     f"NaoTouch{shape}{kind}-v1"
@@ -100,8 +102,8 @@ def test_an_unknown_instruction_lists_those_there_are(capsys, policy_file):
         (["video", IDS[0], "--episodes", "-1"], "--episodes: got -1"),
         (["video", IDS[0], "--speed", "0"], "speed: got 0"),
         (["video", IDS[0], "--out", "film.avi"], "film.avi"),
-        (["train", IDS[0], "--num-envs", "7"], "num_envs: got 7"),
-        (["train", IDS[0], "--preset", "fast"], "default, posture, paper"),
+        (["train", IDS[0], "--num-envs", "0"], "num_envs: got 0"),
+        (["train", IDS[0], "--preset", "fast"], "default, vision, paper"),
         (["curve", "/nowhere"], "/nowhere"),
         (["video", IDS[0], "--out", "/dev/null/film.mp4"], "cannot write /dev/null/f"),
         (["evaluate", IDS[0], "--json", "/dev"], "cannot write /dev: Is a directory"),
@@ -148,6 +150,23 @@ def test_options_override_the_preset(monkeypatch):
     assert config.agent.senses == ("vision", "touch")
     assert config.out == "runs/mine" and resume is True
     assert config.ppo.clip == CONFIGS["paper"].ppo.clip
+
+
+def test_a_run_that_is_resumed_gives_the_numbers_itself(monkeypatch, tmp_path, capsys):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    stored = dataclasses.replace(
+        CONFIGS["vision"], env_id=IDS[0], out=str(folder), seed=3, total_steps=9000
+    )
+    stored = for_experiment(stored, experiment.get(IDS[0]))
+    (folder / "config.json").write_text(to_json(stored))
+    go_on = (IDS[0], "--out", str(folder), "--resume")
+    config, resume = trained_with(monkeypatch, *go_on, "--threads", "1")
+    assert (config, resume) == (dataclasses.replace(stored, threads=1), True)
+    again = (*go_on, "--preset", "vision", "--seed", "3")
+    assert trained_with(monkeypatch, *again)[0] == stored
+    line = fails(capsys, "train", *go_on, "--preset", "default", "--seed", "3")
+    assert "ppo.gamma (run: 0.95, now: 0.9)" in line
 
 
 FLAGS = [

@@ -291,30 +291,3 @@ def set_random_state(tensors: Mapping[str, Tensor], plain: Mapping[str, Any]) ->
     np.random.set_state((name, keys, *rest))
     version, state, gauss = plain["python"]
     random.setstate((version, tuple(state), gauss))
-
-
-def pack(agent: Agent, optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """Return copies of the weights and of the optimizer's averages, by name."""
-    tensors = {f"agent.{k}": v for k, v in agent.state_dict().items()}
-    for index, averages in optimizer.state_dict()["state"].items():
-        tensors |= {f"optimizer.{index}.{k}": v for k, v in averages.items()}
-    return {name: tensor.detach().clone() for name, tensor in tensors.items()}
-
-
-def unpack(
-    tensors: Mapping[str, Tensor], agent: Agent, optimizer: torch.optim.Optimizer
-) -> None:
-    """Load what `pack` returned into an agent and its optimizer."""
-    agent.load_state_dict(_under("agent", tensors))
-    weights = [w for group in optimizer.param_groups for w in group["params"]]
-    averages: dict[int, dict[str, Tensor]] = {}
-    for name, tensor in _under("optimizer", tensors).items():
-        index, key = name.split(".", 1)
-        shape = weights[int(index)].shape
-        if tensor.ndim and tensor.shape != shape:
-            raise ValueError(f"{name}: got {tuple(tensor.shape)}, expected {shape}")
-        averages.setdefault(int(index), {})[key] = tensor
-    state = optimizer.state_dict()
-    optimizer.load_state_dict(
-        {"state": averages, "param_groups": state["param_groups"]}
-    )

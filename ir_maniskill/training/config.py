@@ -306,7 +306,7 @@ def _from_version_1(old: dict[str, Any]) -> dict[str, Any]:
             "speed": dense.get("push", 0.0),
             "after_foul": dense["spoiled"],
         }
-    except (KeyError, TypeError, ZeroDivisionError) as error:
+    except (KeyError, TypeError, ArithmeticError) as error:
         raise ConfigError(
             f"config of version 1: got one that is not whole ({error!r}), expected the "
             "fields of ir_maniskill 0.1"

@@ -1,0 +1,201 @@
+import dataclasses
+import json
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ir_maniskill.environment.reward_generator import RewardWeights
+from ir_maniskill.training import checkpoint
+from ir_maniskill.training.config import (
+    CONFIGS,
+    SCHEMA,
+    AgentConfig,
+    ConfigError,
+    PPOConfig,
+    TrainConfig,
+    from_data,
+    leaves,
+    migrate,
+    resumed,
+    to_data,
+    to_json,
+)
+
+POLICIES = Path(str(files("ir_maniskill.assets"))) / "policies"
+
+
+def from_json(text):
+    return from_data(json.loads(text))
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_configs_survive_json(name):
+    assert from_json(to_json(CONFIGS[name])) == CONFIGS[name]
+
+
+def test_a_budget_scales_all_that_follows_the_steps():
+    for config in CONFIGS.values():
+        dataclasses.replace(config, total_steps=6000)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"sede": 1}, "unknown: \\['sede'\\]"),
+        ({"seed": "1"}, "seed: got '1', expected a value of type int"),
+        ({"seed": True}, "seed: got True"),
+        ({"seed": 2**31}, "seed: got 2147483648, expected 0 to"),
+        ({"agent": 3}, "AgentConfig: got 3, expected an object"),
+        ({"num_envs": 0}, "num_envs: got 0, expected at least 1"),
+        ({"penalty_warmup": 1.5}, "penalty_warmup: got 1.5, expected 0 to 1"),
+        ({"reward_mode": "none"}, "reward_mode: got 'none'.*'dense'"),
+        ({"control_mode": "pd_ee"}, "control_mode: got 'pd_ee'.*'pd_joint_pos'"),
+        (
+            {"reward_weights": vars(RewardWeights()) | {"after_foul": 1.5}},
+            "reward_weights: got after_foul=1.5",
+        ),
+        ({"schema": 3}, "schema: got 3, expected 1 to 2"),
+    ],
+)
+def test_wrong_configs_say_what_was_got_and_expected(change, message):
+    with pytest.raises(ConfigError, match=message):
+        from_data(to_data(TrainConfig()) | change)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: TrainConfig(control_mode="pd_joint_pos"),
+            "posture_gain: got 1.0, expected 0 where actions do not change",
+        ),
+        (lambda: PPOConfig(gamma=1.1), "gamma: got 1.1, expected 0 to 1"),
+        (lambda: PPOConfig(std=0.0), "std: got 0.0, expected more than 0"),
+        (lambda: PPOConfig(minibatch=4096), "minibatch: got 4096, expected 2 to 2048"),
+        (lambda: TrainConfig(seed=-1), "seed: got -1, expected 0 to"),
+    ],
+)
+def test_values_that_cannot_work_are_refused(make, message):
+    with pytest.raises(ConfigError, match=message):
+        make()
+
+
+def test_a_missing_field_is_named():
+    data = to_data(TrainConfig())
+    del data["ppo"]["clip"]
+    with pytest.raises(ConfigError, match=r"PPOConfig.*missing: \['clip'\]"):
+        from_data(data)
+
+
+def test_the_papers_numbers():
+    paper = CONFIGS["paper"]
+    assert paper.steps_per_env == 32
+    assert (paper.ppo.learning_rate, paper.ppo.epochs) == (1e-5, 60)
+    assert (paper.ppo.gae_lambda, paper.ppo.minibatch) == (1.0, None)
+    assert paper.ppo.std == paper.ppo.std_final == 0.36
+    assert paper.env_kwargs(training=True)["obs_mode"] == "rgb"
+
+
+def test_only_training_asks_for_the_simulators_state():
+    config = TrainConfig(robot="panda")
+    assert config.env_kwargs(training=True)["obs_mode"] == "rgb+state_dict"
+    assert config.env_kwargs(training=False)["obs_mode"] == "rgb"
+    assert config.env_kwargs(training=False)["robot_uids"] == "panda"
+    blind = dataclasses.replace(CONFIGS["vision"], agent=AgentConfig(senses=("touch",)))
+    assert blind.env_kwargs(training=False)["obs_mode"] == "state_dict"
+
+
+# -- Migration -------------------------------------------------------------------------
+
+
+def version_1(name):
+    """Return the config that version 0.1 wrote into a shipped policy."""
+    return checkpoint.read(POLICIES / f"{name}.safetensors").metadata["config"]
+
+
+@pytest.mark.parametrize("path", sorted(POLICIES.glob("*.safetensors")), ids=str)
+def test_what_was_shipped_with_0_1_is_understood(path):
+    old = checkpoint.read(path).metadata["config"]
+    config = from_data(old)
+    kept = ("env_id", "seed", "total_steps", "control_mode", "frames", "camera_width")
+    assert all(getattr(config, name) == old[name] for name in kept)
+    assert list(config.agent.senses) == old["agent"]["senses"]
+    assert from_json(to_json(config)) == config
+
+
+def test_a_config_of_version_1_keeps_its_meaning():
+    old = version_1("NaoTouchCubeSingle-v1")
+    config = from_data(old)
+    assert config.agent.posture_gain == 2.0  # its gain grew from 1 to 2
+    assert config.ppo.steps_per_update == 64 * 32
+    assert (config.ppo.std, config.ppo.std_final) == (1.0, 0.05)
+    assert config.penalty_warmup == 20_000 / 60_000
+    weights = RewardWeights(approach=0.5, foul=0.5, speed=6.0, after_foul=0.25)
+    assert (config.robot, config.reward_weights) == ("nao", weights)
+    assert "schema" not in old and migrate(old)["seed"] == old["seed"]
+
+
+def test_a_config_of_before_postures_and_backends_has_neither():
+    old = version_1("NaoTouchButtonShuffled-v1")
+    later = {"sim_backend", "render_backend", "lenient_steps"}
+    old = {name: value for name, value in old.items() if name not in later}
+    for name in ("posture_gain", "posture_gain_final"):
+        del old["agent"][name]
+    del old["dense_weights"]["push"], old["dense_weights"]["each_finger"]
+    old["agent"]["std_mode"] = "fixed"
+    config = from_data(old)
+    assert (config.sim_backend, config.penalty_warmup) == ("physx_cpu", 0)
+    assert (config.agent.posture_gain, config.reward_weights.speed) == (0.0, 0.0)
+    assert config.ppo.std == config.ppo.std_final == 0.5
+
+
+def replace_leaf(data, path, value):
+    """Return JSON data with another value at a path of keys."""
+    if not path:
+        return value
+    return data | {path[0]: replace_leaf(data[path[0]], path[1:], value)}
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+    max_leaves=4,
+)
+NEW, OLD = to_data(TrainConfig()), version_1("NaoTouchCubeSingle-v1")
+PARTS = ("agent", "ppo", "reward_weights", "dense_weights")
+
+
+@given(st.sampled_from((NEW, OLD)), st.data(), JSON)
+def test_whatever_a_config_says_it_is_a_config_or_refused(data, draw, value):
+    inner = [(part, name) for part in PARTS for name in data.get(part, {})]
+    path = draw.draw(st.sampled_from([*((name,) for name in data), *inner]))
+    try:
+        config = from_data(replace_leaf(data, path, value))
+    except ConfigError as error:
+        assert "got" in str(error)
+        return
+    assert from_json(to_json(config)) == config
+    assert config.steps_per_env > 0
+
+
+# -- Resuming --------------------------------------------------------------------------
+
+
+def test_a_resumed_run_has_its_own_config_but_for_what_is_given():
+    ppo = PPOConfig(gamma=0.7)
+    stored = TrainConfig(env_id="A-v1", out="a", ppo=ppo, total_steps=60_000, seed=1)
+    given = TrainConfig(out="b", threads=1, seed=1)
+    expected = dataclasses.replace(stored, out="b", threads=1)
+    assert resumed(stored, given) == expected
+    wrong = dataclasses.replace(given, ppo=PPOConfig(gamma=0.8))
+    with pytest.raises(ConfigError, match=r"ppo.gamma \(run: 0.7, now: 0.8\)"):
+        resumed(stored, wrong)
+
+
+def test_the_leaves_of_a_config_are_all_its_numbers():
+    names = leaves(TrainConfig())
+    assert names["ppo.gamma"] == 0.9 and names["reward_weights.hold"] == 1.0
+    assert "ppo" not in names and to_data(TrainConfig())["schema"] == SCHEMA
