@@ -94,12 +94,12 @@ class TrainConfig:
 
     env_id: str = "NaoTouchCubeSingle-v1"
     """Task to learn."""
-    robot: str = "nao"
-    """Robot that learns it, by the name that `robot_uids` takes."""
     out: str = "runs/default"
     """Folder of the run: checkpoints, metrics, TensorBoard events."""
     seed: int = 0
     """Seed of weights, exploration and scenes."""
+    robot: str = "nao"
+    """Robot that learns it, by the name that `robot_uids` takes."""
     total_steps: int = 250_000
     """Environment steps, over all envs; rounded up to whole updates."""
     num_envs: int = 16
