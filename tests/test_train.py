@@ -14,6 +14,7 @@ from toy_envs import LENGTH, SENTENCES, ToyVectorEnv, toy_config
 import ir_maniskill
 from ir_maniskill import experiment as catalog
 from ir_maniskill.agent import Agent, StateSpec
+from ir_maniskill.environment.vector import info_of_step
 from ir_maniskill.evaluation.evaluate import EvaluationReport, Rate, Score
 from ir_maniskill.training import checkpoint, distributed, ppo, run_folder, runner
 from ir_maniskill.training import train as training
@@ -418,11 +419,11 @@ def test_what_final_infos_say_of_episodes_that_go_on_does_not_count():
 
     done, counts = torch.tensor([True, False]), runner.StepCounts()
     stale = {**info(0, 1), "final_info": info(1, 5)}  # the first episode has ended
-    merged = runner.info_of_step(stale, done)
+    merged = info_of_step(stale, done)
     assert merged["right_fingers"].tolist() == [1, 1]
     assert merged["reward_terms"].tolist() == [[1], [1]]
     stale["success"][1] = stale["success_once"][1] = False
-    counts.add(torch.zeros(2), done, runner.info_of_step(stale, done))
+    counts.add(torch.zeros(2), done, info_of_step(stale, done))
     assert (counts.holding, counts.success, counts.episodes) == (1, 1, 1)
 
 

@@ -78,7 +78,7 @@ class ToyVectorEnv:
         }
         truncated = self.clock >= LENGTH
         if truncated.any():
-            ended = {"final_observation": self._observe(), "final_info": info}
+            ended = {"final_obs": self._observe(), "final_info": info}
             self._start(truncated)
             info = {name: torch.zeros_like(value) for name, value in info.items()}
             info |= ended

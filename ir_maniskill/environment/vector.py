@@ -14,6 +14,7 @@ import gymnasium as gym
 import torch
 from mani_skill.envs.utils.system.backend import sim_backend_name_mapping
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
+from torch import Tensor
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.arguments import RESET_OPTIONS, require_names, seeds_of
@@ -134,6 +135,21 @@ class GpuVectorEnv(ManiSkillVectorEnv):
     def get_attr(self, name: str) -> Any:
         """Return the attribute, which all envs of the batch share."""
         return self._env.get_wrapper_attr(name)
+
+
+def info_of_step(info: dict[str, Any], done: Tensor) -> dict[str, Tensor]:
+    """Return what was measured after the step, also where a new episode has begun.
+
+    Rows of `final_info` whose episode goes on are stale: those of `info` count.
+    """
+    if "final_info" not in info:
+        return info
+    final, merged = info["final_info"], {}
+    for name, value in final.items():
+        if isinstance(value, Tensor) and isinstance(info.get(name), Tensor):
+            rows = done.view(-1, *[1] * (value.ndim - 1))
+            merged[name] = torch.where(rows, value, info[name])
+    return merged
 
 
 VectorEnv = GpuVectorEnv | ProcessVectorEnv

@@ -25,7 +25,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ir_maniskill.environment.state import State, StateStack
-from ir_maniskill.environment.vector import VectorEnv, make_vec
+from ir_maniskill.environment.vector import VectorEnv, info_of_step, make_vec
 from ir_maniskill.files import replacing
 
 Policy = Callable[[State], Tensor]
@@ -426,7 +426,7 @@ def _play(
             obs, reward, terminated, truncated, info = envs.step(action)
             done = terminated | truncated
             env = playing.nonzero()[:, 0]
-            record.add(episode[env], env, reward, info.get("final_info", info))
+            record.add(episode[env], env, reward, info_of_step(info, done))
             playing &= ~done.cpu()
             state = stack.push(obs, done)
     return record

@@ -171,6 +171,11 @@ class TrainConfig:
         return -(-self.ppo.steps_per_update // self.num_envs)
 
     @property
+    def steps_per_update(self) -> int:
+        """T x N, the steps all envs make for one update."""
+        return self.steps_per_env * self.num_envs
+
+    @property
     def needs_state(self) -> bool:
         """Whether training reads the simulator's state, beside what the actor sees."""
         agent = self.agent

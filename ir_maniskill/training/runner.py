@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from ir_maniskill.agent.agent import Agent
 from ir_maniskill.environment.state import State, StateStack
-from ir_maniskill.environment.vector import VectorEnv
+from ir_maniskill.environment.vector import VectorEnv, info_of_step
 from ir_maniskill.evaluation.evaluate import EvaluationReport, evaluate_policy
 from ir_maniskill.training import checkpoint, distributed
 from ir_maniskill.training.algorithm import Algorithm, Outcome
@@ -140,7 +140,7 @@ class Runner:
             )
             done, final = terminated | truncated, None
             if "final_info" in info:
-                final = self._here(self.stack.peek(info["final_observation"]))
+                final = self._here(self.stack.peek(info["final_obs"]))
             info = info_of_step(info, done)
             self.state = self._here(self.stack.push(obs, done))
             self.counts.add(reward, done, info)
@@ -291,21 +291,6 @@ class Runner:
 
 
 # -- Counting --------------------------------------------------------------------------
-
-
-def info_of_step(info: dict[str, Any], done: Tensor) -> dict[str, Tensor]:
-    """Return what was measured after the step, also where a new episode has begun.
-
-    Rows of `final_info` whose episode goes on are stale: those of `info` count.
-    """
-    if "final_info" not in info:
-        return info
-    final, merged = info["final_info"], {}
-    for name, value in final.items():
-        if isinstance(value, Tensor) and isinstance(info.get(name), Tensor):
-            rows = done.view(-1, *[1] * (value.ndim - 1))
-            merged[name] = torch.where(rows, value, info[name])
-    return merged
 
 
 @dataclass
