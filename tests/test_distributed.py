@@ -118,7 +118,7 @@ def learn_from_the_fixed_rollout(out):
         agent.observe(distributed.gather(rollout.state["privileged"].flatten(0, 1)))
         got["buffers"] = torch.cat([b.flatten() for b in agent.buffers()])
         # Without minibatches no shuffling tells the joined batch from the shares.
-        epochs = {"epochs": 20, "max_kl": 1e-4, "target_kl": None}
+        epochs = {"epochs": 20, "target_kl": 3e-5}
         whole = dataclasses.replace(config, minibatch=None, **epochs)
         optimizer = torch.optim.SGD(agent.parameters(), 0.05)
         got["figures"] = ppo.improve(agent, optimizer, rollout, whole)

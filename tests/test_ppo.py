@@ -287,7 +287,7 @@ def collected():
 
 def test_epochs_stop_once_the_policy_moved_far_enough():
     agent, optimizer, rollout = collected()
-    eager = PPOConfig(epochs=20, minibatch=64, max_kl=1e-3)
+    eager = PPOConfig(epochs=20, minibatch=64, target_kl=3e-4)
     assert ppo.improve(agent, optimizer, rollout, eager)["epochs"] < 20
 
 

@@ -229,6 +229,7 @@ def test_a_second_ctrl_c_does_not_cut_the_saving_short(
 # -- Disk ------------------------------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_a_disk_that_fills_up_keeps_the_last_good_checkpoint(tmp_path, before_update):
     def fill():
         filler = (tmp_path / "filler").open("wb", buffering=0)

@@ -57,12 +57,11 @@ class PPOConfig:
     """Whether the value of the last observation stands for what truncation hides."""
     clip: float = 0.2
     """Largest change of an action's probability ratio that is rewarded."""
-    max_kl: float | None = 0.05
-    """No further epoch once the policy moved this far [nat]; None: all epochs."""
     target_kl: float | None = 0.015
     """How far an epoch should find the policy moved [nat]: Adam's step size shrinks
     where it is twice as far, to 1e-5 at least, and grows where it is half, to 1e-3 at
-    most; None: it stays."""
+    most; where it is more than three times as far no epoch follows. None: the step
+    size stays, and all epochs are made."""
     max_grad_norm: float | None = 0.5
     """Longest gradient; None: any."""
     std: float = 1.0
@@ -83,7 +82,7 @@ class PPOConfig:
         for name in ("learning_rate", "clip", "std", "std_final"):
             value = getattr(self, name)
             require(0 < value < math.inf, name, value, "more than 0, and finite")
-        for name in ("max_kl", "target_kl", "max_grad_norm"):
+        for name in ("target_kl", "max_grad_norm"):
             value = getattr(self, name)
             require(value is None or value > 0, name, value, "more than 0, or None")
 
@@ -239,7 +238,6 @@ CONFIGS: dict[str, TrainConfig] = {
             gae_lambda=1.0,
             bootstrap=False,
             clip=0.25,
-            max_kl=None,
             target_kl=None,
             max_grad_norm=None,
             std=0.36,
@@ -320,7 +318,7 @@ def _from_version_1(old: dict[str, Any]) -> dict[str, Any]:
     gain = agent.pop("posture_gain_final", None) or agent.get("posture_gain", 0.0)
     new |= {"agent": agent | {"posture_gain": gain}, "ppo": ppo}
     _drop(new, ("eval_seed", "stop_at_success"))
-    _drop(ppo, ("value_weight", "entropy_weight", "normalize_reward"))
+    _drop(ppo, ("value_weight", "entropy_weight", "normalize_reward", "max_kl"))
     if new.get("reward_mode") == "normalized_dense":
         new["reward_mode"] = "dense"
     return new

@@ -29,6 +29,8 @@ DECIMETER = 0.1
 """Unit of the auxiliary loss [m]: about the spacing of the objects."""
 RATE_CHANGE = 1.5
 """Factor by which the step size changes, at most once an epoch."""
+TOO_FAR = 10 / 3
+"""Of `target_kl`: no further epoch once the policy moved so far."""
 LOWEST_RATE, HIGHEST_RATE = 1e-5, 1e-3
 """Up to which the step size shrinks and grows."""
 
@@ -157,7 +159,8 @@ def improve(
         figures = dict(zip(history, means.tolist(), strict=True))
         figures["epochs"] = epoch + 1
         adapt_rate(optimizer, figures["kl"], config.target_kl)
-        if config.max_kl is not None and figures["kl"] > config.max_kl:
+        target = config.target_kl
+        if target is not None and figures["kl"] > TOO_FAR * target:
             break
     weights = dict(agent.named_parameters())
     check_finite(weights, "weight", "the learning rate is too high")

@@ -100,8 +100,9 @@ class RunFolder:
         Returns:
             The steps of the last evaluation recorded; 0 if there is none.
         """
-        for leftover in self.path.glob(".*.tmp"):  # of a process that was killed
-            leftover.unlink()
+        for pattern in (".*.tmp", ".[0-9]*.*"):  # what a process left when killed
+            for leftover in self.path.glob(pattern):
+                leftover.unlink()
         self._events = SummaryWriter(str(self.path), purge_step=steps + 1)
         text = to_json(config) + "\n"
         checkpoint.replace(self.path / "config.json", text.encode())
