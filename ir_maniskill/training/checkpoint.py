@@ -229,6 +229,10 @@ def load_policy(path: Path | str) -> tuple[Agent, TrainConfig, dict[str, Any]]:
     """
     stored = read(Path(path))
     try:
+        gain = stored.tensors.pop("actor.posture_gain", None)
+        if gain is not None:  # in version 0.1 it changed as training went on
+            changed = {"posture_gain": float(gain), "posture_gain_final": None}
+            stored.metadata["config"]["agent"] |= changed
         config = from_data(stored.metadata["config"])
         spec = decode(StateSpec, stored.metadata["spec"])
         agent = _agent(config, spec, stored)
