@@ -13,9 +13,9 @@ import ir_maniskill
 
 
 def specs() -> list[str]:
-    """Return what pdoc is to document: by itself it would stop at `__all__`."""
-    children = pkgutil.iter_modules(ir_maniskill.__path__, "ir_maniskill.")
-    return ["ir_maniskill", *(child.name for child in children)]
+    """Return all modules; pdoc by itself passes over those missing in `__all__`."""
+    inside = pkgutil.walk_packages(ir_maniskill.__path__, "ir_maniskill.")
+    return ["ir_maniskill", *(module.name for module in inside)]
 
 
 def write(out: Path) -> None:

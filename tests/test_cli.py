@@ -181,7 +181,7 @@ FLAGS = [
 ]
 
 
-@settings(max_examples=40, suppress_health_check=list(HealthCheck))
+@settings(max_examples=20, suppress_health_check=list(HealthCheck))
 @given(st.sampled_from(FLAGS), st.text(max_size=8) | st.integers().map(str))
 def test_whatever_a_number_is_set_to_it_is_taken_or_refused(monkeypatch, flag, text):
     monkeypatch.setattr(cli, "train", lambda config, resume: None)

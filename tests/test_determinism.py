@@ -4,7 +4,6 @@ import pytest
 import torch
 from trees import leaves
 
-import ir_maniskill
 from ir_maniskill import make_vec
 
 STEPS = 36
@@ -32,7 +31,7 @@ def trajectory(task: str, seeds: list[int], row: int) -> list[dict[str, torch.Te
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", ir_maniskill.available()[:8])
+@pytest.mark.parametrize("task", ["NaoTouchCubeMulti-v1", "NaoTouchButtonShuffled-v1"])
 def test_a_seed_fixes_the_trajectory_across_processes_and_num_envs(task: str) -> None:
     alone = trajectory(task, [7], 0)
     among = trajectory(task, [3, 7, 5], 1)

@@ -23,6 +23,7 @@ def broken(monkeypatch):
 
 
 @pytest.mark.render
+@pytest.mark.slow
 def test_this_machine_renders_and_says_through_what():
     diagnosis = doctor.diagnose()
     assert diagnosis.healthy, diagnosis.render_error

@@ -90,6 +90,7 @@ def datasets(group: h5py.Group) -> dict[str, np.ndarray]:
     return found
 
 
+@pytest.mark.slow
 def test_replayed_actions_lead_to_the_same_states(recorded: Path) -> None:
     replayed = replay(recorded)
     with h5py.File(recorded) as first, h5py.File(replayed) as second:
@@ -102,6 +103,7 @@ def test_replayed_actions_lead_to_the_same_states(recorded: Path) -> None:
             assert before["success"].any()
 
 
+@pytest.mark.slow
 def test_replayed_states_are_those_recorded(recorded: Path) -> None:
     replayed = replay(recorded, use_env_states=True)
     with h5py.File(recorded) as first, h5py.File(replayed) as second:
@@ -120,6 +122,7 @@ def test_replayed_states_are_those_recorded(recorded: Path) -> None:
                     np.testing.assert_array_equal(a, b, path)
 
 
+@pytest.mark.slow
 def test_a_row_of_a_recording_restores_the_whole_state(recorded: Path) -> None:
     env: Any = gym.make(
         "RecordFruit-v1",
@@ -202,6 +205,7 @@ def test_the_state_layout_starts_anew_by_itself() -> None:
 
 
 @pytest.mark.render
+@pytest.mark.slow
 def test_gymnasium_records_a_playable_video_in_real_time(tmp_path: Path) -> None:
     pytest.importorskip("moviepy", reason="needs the extra `video`")
     camera = {"width": 128, "height": 96, "shader_pack": "trivial"}

@@ -68,6 +68,7 @@ def test_random_actions_leave_a_film(tmp_path: Path) -> None:
     assert len(list(tmp_path.glob("runs/random_actions/*.mp4"))) == 1
 
 
+@pytest.mark.slow
 def test_custom_experiment_can_be_stepped(tmp_path: Path) -> None:
     out = run(tmp_path, script("custom_experiment.py"))
     assert "lemon" in out
@@ -75,6 +76,7 @@ def test_custom_experiment_can_be_stepped(tmp_path: Path) -> None:
 
 
 @pytest.mark.render
+@pytest.mark.slow
 def test_vector_envs_finish_two_episodes_each(tmp_path: Path) -> None:
     out = run(tmp_path, script("vector_envs.py"), "--num-envs", "2")
     assert len(re.findall(r"\d of 2 touched", out)) == 2
