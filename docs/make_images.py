@@ -18,7 +18,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 import ir_maniskill  # noqa: F401 - registers the tasks
 from ir_maniskill import experiment as catalog
-from ir_maniskill.environment.state import CAMERAS
+from ir_maniskill.environment.senses import cameras
 from ir_maniskill.evaluation.evaluate import EVALUATION_SEED
 from ir_maniskill.evaluation.video import record, write_video
 from ir_maniskill.training.checkpoint import load_policy
@@ -61,7 +61,7 @@ def shoot(task: str, size: tuple[int, int]) -> tuple[Image.Image, list[Image.Ima
     view = Image.fromarray(env.render()[0].cpu().numpy()).resize(size)
     eyes = [
         Image.fromarray(obs["sensor_data"][name]["rgb"][0].cpu().numpy())
-        for name in CAMERAS
+        for name in cameras(obs)
     ]
     env.close()
     return view, eyes

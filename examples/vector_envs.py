@@ -12,7 +12,7 @@ import torch
 import tyro
 
 from ir_maniskill import make_vec
-from ir_maniskill.environment.state import StateStack
+from ir_maniskill.environment.senses import StateStack
 
 
 def main(num_envs: int = 4, steps: int = 64) -> None:

@@ -23,6 +23,7 @@ from ir_maniskill.experiment import (
     touch_instructions,
 )
 from ir_maniskill.goals import Avoid, Both, Goal, Push, Ref, Then, Touch
+from ir_maniskill.policy import Policy, load_policy
 from ir_maniskill.registration import register
 
 __all__ = [
@@ -32,12 +33,14 @@ __all__ = [
     "Goal",
     "Instruction",
     "Jitter",
+    "Policy",
     "Push",
     "Ref",
     "Then",
     "Touch",
     "TouchObject",
     "available",
+    "load_policy",
     "make_vec",
     "register",
     "touch_instructions",

@@ -9,7 +9,6 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -27,8 +26,14 @@ from ir_maniskill.evaluation.evaluate import (
     write_report,
 )
 from ir_maniskill.experiment import Experiment
+from ir_maniskill.policy import shipped
 from ir_maniskill.training import distributed
-from ir_maniskill.training.checkpoint import load_policy, writing
+from ir_maniskill.training.checkpoint import (
+    MismatchError,
+    load_policy,
+    require_match,
+    writing,
+)
 from ir_maniskill.training.config import (
     CONFIGS,
     RenderBackend,
@@ -387,15 +392,14 @@ def _find_policy(task: Experiment, given: Path | None) -> Path:
         if not given.is_file():
             raise UsageError(f"--checkpoint: got {given}, expected an existing file")
         return given
-    folder = resources.files("ir_maniskill.assets") / "policies"
-    shipped = Path(str(folder / f"{task.id}.safetensors"))
-    if not shipped.is_file():
+    path = shipped(task.id)
+    if not path.is_file():
         raise UsageError(
             f"no policy for {task.id}: none was given and none ships with the package "
-            f"(looked for {shipped}). Train one: ir-maniskill train {task.id}; then "
+            f"(looked for {path}). Train one: ir-maniskill train {task.id}; then "
             f"add --checkpoint runs/{task.id}/best.safetensors"
         )
-    return shipped
+    return path
 
 
 def _load(
@@ -403,11 +407,11 @@ def _load(
 ) -> tuple[Agent, TrainConfig, dict[str, Any]]:
     """Return what `load_policy` does, of a policy for this task."""
     agent, config, facts = load_policy(path)
-    if config.env_id != task.id and not any_task:
-        raise UsageError(
-            f"{path}: got a policy for {config.env_id}, expected one for {task.id}; "
-            "name that task, or add --any-task to see what it does in this one"
-        )
+    try:
+        require_match(config, facts, task, any_task=any_task)
+    except MismatchError as error:
+        hint = "" if any_task else "; name its task, or add --any-task to try it here"
+        raise UsageError(f"{path}: {error}{hint}") from error
     return agent, config, facts
 
 

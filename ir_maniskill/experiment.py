@@ -7,11 +7,13 @@ An `Experiment` is plain data; a new task is a new `Experiment` handed to
 from __future__ import annotations
 
 import itertools
+import logging
 import math
 import re
 import unicodedata
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import lru_cache
 from numbers import Integral, Real
 from typing import Any, Literal, get_args
 
@@ -19,6 +21,8 @@ import torch
 
 from ir_maniskill.goals import COLORS, SHAPES, Goal, GoalError, Ref, Touch
 from ir_maniskill.snapshot import Snapshot
+
+log = logging.getLogger(__name__)
 
 VOCABULARY = (
     "<pad>",
@@ -184,6 +188,8 @@ class Experiment:
         if self.vocabulary == ():
             object.__setattr__(self, "vocabulary", words_of(self.sentences))
         self._check_vocabulary()
+        for sentence in self.sentences:
+            warn_of_unknown(sentence, self.vocabulary)
         self._check_instructions()
         self._check_layout()
 
@@ -272,6 +278,14 @@ def tokenize(sentence: str, vocabulary: tuple[str, ...] = VOCABULARY) -> list[in
     """
     ids = {word: index for index, word in enumerate(vocabulary)}
     return [ids.get(word, UNK) for word in split_words(sentence)]
+
+
+@lru_cache(1000)
+def warn_of_unknown(sentence: str, vocabulary: tuple[str, ...]) -> None:
+    """Log, once for each sentence, which of its words are read as `<unk>`."""
+    unknown = [word for word in split_words(sentence) if word not in vocabulary]
+    if unknown:
+        log.warning("%r: not in the vocabulary: %s", sentence, ", ".join(unknown))
 
 
 def split_words(sentence: str) -> list[str]:

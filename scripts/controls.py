@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from ir_maniskill import experiment as catalog
-from ir_maniskill.environment.state import State
+from ir_maniskill.environment.senses import State
 from ir_maniskill.environment.vector import make_vec
 from ir_maniskill.evaluation.evaluate import EVALUATION_SEED, evaluate_policy
 from ir_maniskill.experiment import Experiment, tokenize

@@ -1,7 +1,7 @@
 """Ships the best policy of a run with the package: `ship_policy.py runs/NAME`.
 
-Stores the weights with 16 bits, evaluates the policy as stored, and writes it to
-`assets/policies/ID.safetensors`, with its figures beside it and inside.
+Evaluates the policy and writes it to `assets/policies/ID.safetensors`, with its figures
+beside it and inside.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import argparse
 import dataclasses
 import json
 import subprocess
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -27,17 +26,15 @@ FOLDER = Path(__file__).parent.parent / "assets" / "policies"
 
 
 def ship(run: Path, episodes: int, scenes: int) -> EvaluationReport:
-    """Round, evaluate and write the best policy of a run.
+    """Evaluate and write the best policy of a run.
 
     Args:
         run: Folder of the run.
         episodes: Episodes for each sentence.
         scenes: Scenes in which to give it every sentence, if there are several.
     """
-    stored = halved(checkpoint.read(run / "best.safetensors"))
-    with tempfile.TemporaryDirectory() as folder:
-        checkpoint.write(path := Path(folder) / "rounded.safetensors", stored)
-        agent, config, facts = checkpoint.load_policy(path)
+    stored = checkpoint.read(run / "best.safetensors")
+    agent, config, facts = checkpoint.load_policy(run / "best.safetensors")
     play: dict[str, Any] = {
         "seed": EVALUATION_SEED,
         "frames": config.frames,
@@ -60,15 +57,6 @@ def ship(run: Path, episodes: int, scenes: int) -> EvaluationReport:
     text = json.dumps({**origin, **figures}, indent=2)
     path.with_suffix(".json").write_text(text + "\n")
     return report
-
-
-def halved(stored: checkpoint.Stored) -> checkpoint.Stored:
-    """Return the contents with 16 bits a weight."""
-    tensors = {
-        name: tensor.half() if tensor.is_floating_point() else tensor
-        for name, tensor in stored.tensors.items()
-    }
-    return dataclasses.replace(stored, tensors=tensors)
 
 
 def _commit() -> str:

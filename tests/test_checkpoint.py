@@ -1,11 +1,14 @@
+import dataclasses
 import io
 import json
 import math
 import os
 import pickle
 import random
+import re
 import resource
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,10 +17,12 @@ import torch
 from PIL import Image
 from toy_envs import SPEC, ToyVectorEnv, toy_config, toy_state
 
+from ir_maniskill import experiment as catalog
 from ir_maniskill.agent import Agent
-from ir_maniskill.training import checkpoint, quantize
+from ir_maniskill.training import checkpoint
 from ir_maniskill.training.algorithm import averages, copied
-from ir_maniskill.training.checkpoint import CheckpointError, Stored
+from ir_maniskill.training.checkpoint import CheckpointError, MismatchError, Stored
+from ir_maniskill.training.config import AgentConfig, TrainConfig
 from ir_maniskill.training.finite import TrainingDivergedError
 from ir_maniskill.training.ppo import PPO
 from ir_maniskill.training.run_folder import RunFolder
@@ -56,31 +61,38 @@ def test_random_generators_go_on_where_they_were():
     assert draw() == first
 
 
-@pytest.mark.parametrize("few_bits", [False, True])
-def test_a_policy_acts_after_loading_as_before(trained, tmp_path, few_bits):
+def test_a_policy_acts_after_loading_as_before(trained, tmp_path):
     agent, _, config = trained
     path = tmp_path / "policy.safetensors"
     facts = {"steps": 7, "evaluation": (figures := {"success": 1.0})}
-    states = toy_state(64) if few_bits else None
-    checkpoint.save_policy(path, agent, config, **facts, states=states)
+    checkpoint.save_policy(path, agent, config, **facts)
     loaded, stored_config, metadata = checkpoint.load_policy(path)
     state = toy_state()
-    tolerance = 1e-3 if few_bits else 0
-    assert torch.allclose(loaded.policy(state), agent.policy(state), atol=tolerance)
+    assert torch.allclose(loaded.policy(state), agent.policy(state), atol=1e-3)
     assert stored_config == config
     assert (metadata["steps"], metadata["evaluation"]) == (7, figures)
     with pytest.raises(RuntimeError, match="without its critic"):
         loaded.act(state)
+    again = tmp_path / "again.safetensors"  # what was rounded once stays as it is
+    checkpoint.save_policy(again, loaded, config, **facts)
+    once, twice = checkpoint.read(path).tensors, checkpoint.read(again).tensors
+    assert once.keys() == twice.keys()
+    assert all(torch.equal(once[name], twice[name]) for name in once)
+
+
+def test_what_is_counted_keeps_all_its_bits(tmp_path):
+    config = toy_config(tmp_path)
+    shape = dataclasses.replace(config.agent, senses=("state",))
+    agent = Agent(shape, SPEC)
+    agent.encoder.standardize.count.fill_(10**6)  # 16 bits end at 65504
+    agent.encoder.standardize.variance.fill_(1e-6)
+    checkpoint.save_policy(tmp_path / "p", agent, config, steps=1, evaluation={})
+    loaded, *_ = checkpoint.load_policy(tmp_path / "p")
+    assert torch.equal(loaded.encoder.standardize.variance, torch.full((7,), 1e-6))
 
 
 def test_a_policy_file_is_smaller_than_a_checkpoint(trained, tmp_path):
-    agent, optimizer, config = trained
-    small, large = tmp_path / "policy", tmp_path / "checkpoint"
-    policy = {"steps": 0, "evaluation": {}, "states": toy_state()}
-    checkpoint.save_policy(small, agent, config, **policy)
-    facts = checkpoint.describe(agent, config)
-    packed = packed_of(agent, optimizer)
-    checkpoint.write(large, Stored(checkpoint.CHECKPOINT, packed, facts))
+    small, large = write_both(tmp_path, *trained)
     assert small.stat().st_size < large.stat().st_size / 6
     agent_of_checkpoint, _, _ = checkpoint.load_policy(large)
     assert agent_of_checkpoint.act(toy_state()).value.shape == (3,)
@@ -94,47 +106,38 @@ def test_a_crash_while_writing_leaves_the_old_file(trained, tmp_path, monkeypatc
     def full(_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(checkpoint.os, "fsync", full)
+    monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(CheckpointError, match=r"cannot write .*: No space left"):
         checkpoint.save_policy(path, agent, config, steps=2, evaluation={})
     assert checkpoint.read(path).metadata["steps"] == 1
     assert [file.name for file in tmp_path.iterdir()] == ["policy"]
 
 
-def write_both(folder, monkeypatch, agent, optimizer, config):
+def write_both(folder, agent, optimizer, config):
     """Write a policy and a checkpoint of the same agent; return their paths."""
-    monkeypatch.setattr(quantize, "LARGE", 2000)  # some weights have 4 bits, some 8
     paths = folder / "policy", folder / "checkpoint"
-    policy = {"steps": 1, "evaluation": {}, "states": toy_state()}
-    checkpoint.save_policy(paths[0], agent, config, **policy)
+    checkpoint.save_policy(paths[0], agent, config, steps=1, evaluation={})
     facts = checkpoint.describe(agent, config, steps=1)
     packed = packed_of(agent, optimizer)
     checkpoint.write(paths[1], Stored(checkpoint.CHECKPOINT, packed, facts))
     return paths
 
 
-def test_500_mutated_files_each_get_the_one_clear_error(trained, tmp_path, monkeypatch):
+def test_broken_files_get_the_one_clear_error(trained, tmp_path):
     generator = random.Random(0)
-    for path in write_both(tmp_path, monkeypatch, *trained):
+    for path in write_both(tmp_path, *trained):
         good = path.read_bytes()
         header = 8 + int.from_bytes(good[:8], "little")
-        for case in range(250):
-            data, kind = bytearray(good), case % 5
-            place = generator.randrange(header if kind < 2 else len(data))
-            if kind == 0:  # one bit, in the header
-                data[place] ^= 1 << generator.randrange(8)
-            elif kind == 1:  # some bytes, in the header
-                data[place : place + 4] = generator.randbytes(4)
-            elif kind == 2:  # cut short
-                del data[place:]
-            elif kind == 3:  # one bit, anywhere
-                data[place] ^= 1 << generator.randrange(8)
-            else:  # something in between
+        for case in range(30):
+            data, place = bytearray(good), generator.randrange(header)
+            if case % 3 == 0:
+                data[place : place + 4] = b"\xff\xff\xff\xff"  # not UTF-8
+            elif case % 3 == 1:
+                del data[generator.randrange(len(data)) :]
+            else:
                 data[place:place] = generator.randbytes(generator.randrange(1, 64))
-            if data == good:
-                continue
             path.write_bytes(data)
-            with pytest.raises(CheckpointError):
+            with pytest.raises(CheckpointError, match="not ours"):
                 checkpoint.load_policy(path)
 
 
@@ -171,14 +174,12 @@ def distort(stored, generator):
     return Stored(stored.kind, tensors, metadata)
 
 
-def test_500_files_of_wrong_values_but_right_checksums_work_or_get_the_error(
-    trained, tmp_path, monkeypatch
-):
+def test_files_of_wrong_values_work_or_get_the_error(trained, tmp_path):
     generator, refused = random.Random(0), 0
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    for path in write_both(tmp_path, monkeypatch, *trained):
+    for path in write_both(tmp_path, *trained):
         stored = checkpoint.read(path)
-        for _ in range(250):
+        for _ in range(50):
             checkpoint.write(path, distort(stored, generator))
             try:
                 agent, *_ = checkpoint.load_policy(path)
@@ -186,8 +187,8 @@ def test_500_files_of_wrong_values_but_right_checksums_work_or_get_the_error(
             except CheckpointError:
                 refused += 1
             except ValueError as error:  # its weights fit, the state does not
-                assert "this agent was made for" in str(error)
-    assert refused > 100
+                assert re.search("this agent|expected", str(error))
+    assert refused > 20
     after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     assert after - before < 300_000, "sizes were believed before they were checked [KB]"
 
@@ -218,12 +219,13 @@ def test_foreign_files_are_refused(tmp_path, data):
         checkpoint.load_policy(path)
 
 
-def test_little_is_read_of_a_large_foreign_file(tmp_path, monkeypatch):
-    path = tmp_path / "large.safetensors"
-    path.write_bytes(safetensors.torch.save({"weight": torch.zeros(1000)}))
-    monkeypatch.setattr(Path, "read_bytes", lambda _: pytest.fail("read it all"))
-    with pytest.raises(CheckpointError, match="not ours"):
-        checkpoint.load_policy(path)
+def test_a_file_of_a_later_version_says_so(trained, tmp_path, monkeypatch):
+    agent, _, config = trained
+    monkeypatch.setattr(checkpoint, "FORMAT", 3)
+    checkpoint.save_policy(tmp_path / "new", agent, config, steps=1, evaluation={})
+    monkeypatch.undo()
+    with pytest.raises(CheckpointError, match=r"format 3, written by ir_maniskill \d"):
+        checkpoint.load_policy(tmp_path / "new")
 
 
 def test_what_is_no_file_is_refused_without_waiting(tmp_path):
@@ -257,14 +259,14 @@ def test_a_checkpoint_of_wrong_values_is_resumed_or_refused(tmp_path):
     runner = Runner(config, folder, ToyVectorEnv(8), lambda: ToyVectorEnv(8), PPO)
     runner.advance()
     stored, refused = runner.snapshot(), 0
-    for _ in range(100):
+    for _ in range(40):
         checkpoint.write(folder.last, distort(stored, generator))
         try:
             runner.restore(checkpoint.read(folder.last))
         except CheckpointError:
             refused += 1
         assert runner.steps >= 0
-    assert 20 < refused < 100
+    assert 8 < refused < 40
     folder.close()
 
 
@@ -295,3 +297,95 @@ def test_weights_of_another_size_than_their_config_are_refused(trained, tmp_path
     checkpoint.write(path, Stored(checkpoint.POLICY, weights, facts))
     with pytest.raises(CheckpointError, match=r"do not belong together.*size mismatch"):
         checkpoint.load_policy(path)
+
+
+# -- Files of 0.1 ----------------------------------------------------------------------
+
+
+def test_numbers_of_4_and_8_bits_are_read():
+    eights = torch.tensor([[1, -2], [127, -128]], dtype=torch.int8)
+    pairs = torch.tensor([[0x08, 0xF7]], dtype=torch.uint8)  # low halves first, less 8
+    scale = torch.tensor([0.5, 2.0])
+    kept = {"a": eights, "a.scale": scale, "b": pairs, "b.scale": scale[:1]}
+    weights = checkpoint._dequantized(kept | {"lonely.scale": scale})
+    assert weights["a"].tolist() == [[0.5, -1.0], [254.0, -256.0]]
+    assert weights["b"].tolist() == [[0.0, -4.0, -0.5, 3.5]]
+    assert set(weights) == {"a", "b", "lonely.scale"}
+
+
+# -- What a policy was trained for -----------------------------------------------------
+
+
+@pytest.fixture
+def task():
+    return catalog.get("NaoTouchCubeTriangle-v1")
+
+
+def facts_of(task):
+    """Return the config and the metadata of a policy trained for a task, from JSON."""
+    config = TrainConfig(env_id=task.id, agent=AgentConfig(vocabulary=task.vocabulary))
+    agent = SimpleNamespace(config=config.agent, spec=SPEC)
+    return config, json.loads(json.dumps(checkpoint.describe(agent, config)))
+
+
+def test_a_policy_file_tells_task_words_robot_and_longest_sentence(task):
+    _, facts = facts_of(task)
+    told = facts["config"]["agent"]
+    assert facts["env_id"] == "NaoTouchCubeTriangle-v1"
+    assert told["vocabulary"] == list(task.vocabulary)
+    assert (told["language_length"], facts["config"]["robot"]) == (16, "nao")
+    assert facts["task"]["objects"][0]["is"] == "TouchObject"
+    assert facts["version"].count(".") >= 2
+
+
+def test_a_policy_meets_what_it_was_trained_for(task):
+    checkpoint.require_match(*facts_of(task), task)
+    checkpoint.require_match(*facts_of(task), task, "nao")
+
+
+def swapped(words):
+    """Return a vocabulary with two words in each other's place."""
+    return (*words[:5], words[6], words[5], *words[7:])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda task: {"vocabulary": swapped(task.vocabulary)},
+            r"vocabulary\[5\]: got 'blue', expected 'red'$",
+        ),
+        (
+            lambda task: {"vocabulary": (*task.vocabulary, "push")},
+            r"vocabulary: got .*'button'\), expected .*'push'\)$",
+        ),
+        (
+            lambda task: {"shuffled": True},
+            "Triangle-v1: shuffled: got False, expected True$",
+        ),
+        (
+            lambda task: {"episode_steps": 64, "reward": "binary"},
+            "reward: got .*'per_finger', expected 'binary'; episode_steps: got .*64$",
+        ),
+        (
+            lambda task: {"instructions": task.instructions[::-1]},
+            r"instructions\[0\]: got .*blue.*, expected .*green",
+        ),
+    ],
+)
+def test_a_task_that_changed_is_refused(task, change, message):
+    now = dataclasses.replace(task, **change(task))
+    with pytest.raises(MismatchError, match=message):
+        checkpoint.require_match(*facts_of(task), now)
+
+
+def test_another_task_or_robot_is_refused(task):
+    other = catalog.get("NaoTouchCubeShuffled-v1")
+    with pytest.raises(MismatchError, match="not fit NaoTouchCubeShuffled-v1: task"):
+        checkpoint.require_match(*facts_of(task), other)
+    checkpoint.require_match(*facts_of(task), other, any_task=True)
+    words = dataclasses.replace(other, vocabulary=swapped(other.vocabulary))
+    with pytest.raises(MismatchError, match=r"vocabulary\[5\]"):
+        checkpoint.require_match(*facts_of(task), words, any_task=True)
+    with pytest.raises(MismatchError, match="robot: .*'nao', expected 'panda'"):
+        checkpoint.require_match(*facts_of(task), task, "panda")

@@ -7,7 +7,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ir_maniskill import cli, experiment
+from ir_maniskill import cli, experiment, register
 from ir_maniskill.agent.agent import Agent, StateSpec
 from ir_maniskill.evaluation import evaluate
 from ir_maniskill.training.checkpoint import save_policy
@@ -39,7 +39,8 @@ def fails(capsys, *arguments):
 def policy_file(tmp_path):
     """An untrained policy for small pictures."""
     config = TrainConfig(camera_width=32, camera_height=64)
-    spec = StateSpec(5, 3, 2, 64, 32, 26, 6, 0, 26)
+    felt = {"proprioception": (3, 26), "target": (3, 26), "touch": (3, 6)}
+    spec = StateSpec({"images": (3, 2, 64, 32, 3), **felt}, 26)
     torch.manual_seed(0)
     agent = Agent(config.agent, spec, policy_only=True)
     path = tmp_path / "policy.safetensors"
@@ -76,12 +77,22 @@ def test_a_file_that_is_no_checkpoint_is_refused(tmp_path, capsys):
 @pytest.mark.parametrize("command", ["evaluate", "video"])
 def test_a_policy_of_another_task_is_refused(command, policy_file, capsys):
     line = fails(capsys, command, IDS[5], "--checkpoint", str(policy_file))
-    assert f"got a policy for {IDS[0]}, expected one for {IDS[5]}" in line
+    assert f"task: got '{IDS[0]}', expected '{IDS[5]}'" in line
     assert "--any-task" in line
 
 
+def test_a_policy_of_other_words_is_refused_in_any_task(policy_file, capsys):
+    task = experiment.get(IDS[5])
+    words = (*task.vocabulary[:5], "red", "blue", *task.vocabulary[7:])
+    task = register(dataclasses.replace(task, id="Words-v1", vocabulary=words))
+    line = fails(
+        capsys, "evaluate", task.id, "--any-task", "--checkpoint", str(policy_file)
+    )
+    assert "vocabulary[5]: got 'blue', expected 'red'" in line
+
+
 def test_without_a_policy_the_error_tells_how_to_train(capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr(cli.resources, "files", lambda _: tmp_path)
+    monkeypatch.setattr(cli, "shipped", lambda name: tmp_path / name)
     line = fails(capsys, "evaluate", IDS[0])
     assert f"ir-maniskill train {IDS[0]}" in line and str(tmp_path) in line
 

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ir_maniskill.environment.reward_generator import RewardWeights
+from ir_maniskill.experiment import VOCABULARY
 from ir_maniskill.training import checkpoint
 from ir_maniskill.training.config import (
     CONFIGS,
@@ -122,12 +123,19 @@ def test_what_was_shipped_with_0_1_is_understood(path):
     config = from_data(old)
     kept = ("env_id", "seed", "total_steps", "control_mode", "frames", "camera_width")
     assert all(getattr(config, name) == old[name] for name in kept)
-    assert list(config.agent.senses) == old["agent"]["senses"]
+    seen, felt, touched = old["agent"]["senses"]
+    assert config.agent.senses == (seen, felt, "target", touched)
+    assert config.agent.vocabulary == VOCABULARY
     assert from_json(to_json(config)) == config
 
 
 def test_a_config_of_version_1_keeps_its_meaning():
     old = version_1("NaoTouchCubeSingle-v1")
+    old["agent"] |= {
+        "posture_gain": 1.0,
+        "posture_gain_final": 2.0,
+        "sees_target": True,
+    }
     config = from_data(old)
     assert config.agent.posture_gain == 2.0  # its gain grew from 1 to 2
     assert config.ppo.steps_per_update == 64 * 32

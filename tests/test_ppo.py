@@ -9,7 +9,7 @@ from toy_envs import SPEC, toy_config, toy_state
 from ir_maniskill.agent import Agent
 from ir_maniskill.agent.agent import Act, Judgement
 from ir_maniskill.environment.reward_generator import TERMS, RewardWeights
-from ir_maniskill.environment.state import StateStack
+from ir_maniskill.environment.senses import StateStack
 from ir_maniskill.training import ppo
 from ir_maniskill.training.algorithm import Outcome
 from ir_maniskill.training.config import ConfigError, PPOConfig, TrainConfig

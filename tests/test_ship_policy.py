@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import pytest
 import ship_policy
-import torch
 from toy_envs import SPEC, toy_config, toy_state
 
 from ir_maniskill.agent import Agent
@@ -72,7 +71,3 @@ def test_a_shipped_policy_has_its_figures_and_origin(tmp_path, monkeypatch, sent
     agent, _, facts = checkpoint.load_policy(stem.with_suffix(".safetensors"))
     assert facts["evaluation"]["commit"] == "0" * 40 and facts["steps"] == 4096
     assert agent.policy(STATE).tolist() == data["acts"], "another one was evaluated"
-    stored = checkpoint.read(stem.with_suffix(".safetensors")).tensors.values()
-    assert {t.dtype for t in stored if t.is_floating_point()} == {torch.float16}
-    learned, *_ = checkpoint.load_policy(run / "best.safetensors")
-    assert learned.policy(STATE).tolist() != data["acts"], "it was not rounded"

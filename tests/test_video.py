@@ -23,7 +23,7 @@ def snapshot(step=3, right=(), wrong=(), history=((False, False),) * 3):
     picture = np.full((64, 32, 3), 200, np.uint8)
     return Snapshot(
         view=gray,
-        cameras=(picture, picture),
+        cameras={"top_camera": picture, "front_camera": picture},
         instruction="Touch the blue cube.",
         hands=HANDS,
         right=tuple(finger in right for finger in range(6)),
@@ -57,7 +57,7 @@ def test_a_frame_has_the_promised_size():
 def test_the_policys_pictures_are_shown_whole_and_not_stretched(rows, columns):
     corner = np.full((rows, columns, 3), 200, np.uint8)
     corner[: rows // 2, : columns // 2] = RIGHT
-    frame = draw(dataclasses.replace(snapshot(), cameras=(corner,)))
+    frame = draw(dataclasses.replace(snapshot(), cameras={"top_camera": corner}))
     x, y, width, height = video.PICTURES[0]
     ys, xs = np.nonzero((frame[y : y + height, x : x + width] == RIGHT).all(axis=-1))
     assert np.ptp(xs) + 1 == width // 2
@@ -106,7 +106,7 @@ def test_the_view_and_the_pictures_are_shown():
 
 
 def test_a_policy_without_pictures_can_be_shown():
-    blind = draw(Snapshot(**{**vars(snapshot()), "cameras": ()}))
+    blind = draw(Snapshot(**{**vars(snapshot()), "cameras": {}}))
     assert share(blind, video.PICTURES[0], video.PAGE) == 1
 
 
@@ -235,7 +235,9 @@ def test_the_video_shows_the_evaluated_episode(multi_vec, reflex, env_kwargs):
     assert sum(sum(s.right) for s in seen) == round(32 * report.overall.right_fingers)
     touched = [right for right, _ in shots[-1].history]
     assert np.mean(touched) == pytest.approx(report.overall.holding)
-    assert all(shot.view.std() > 20 and shot.cameras[0].std() > 20 for shot in shots)
+    assert all(
+        shot.view.std() > 20 and shot.cameras["top_camera"].std() > 20 for shot in shots
+    )
 
 
 def write_metrics(folder: Path, name: str, rows: list[dict]) -> None:

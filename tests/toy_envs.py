@@ -15,9 +15,6 @@ JOINTS, FINGERS = 2, 2
 SENTENCES = ("Go left.", "Go right.")
 GOALS = torch.tensor([-0.6, 0.6])
 
-SPEC = StateSpec(2, 3, 0, 0, 0, JOINTS, FINGERS, 7, JOINTS)
-"""Shapes of `toy_state`, and of a toy agent that reads and does as much."""
-
 
 def toy_state(n=3):
     """Return a state of n envs, at random."""
@@ -29,6 +26,10 @@ def toy_state(n=3):
         "privileged": torch.rand(n, 7),
         "named_position": torch.rand(n, 3),
     }
+
+
+SPEC = StateSpec.of(toy_state(), JOINTS)
+"""Shapes of `toy_state`, and of a toy agent that reads and does as much."""
 
 
 class ToyVectorEnv:

@@ -43,7 +43,6 @@ class Actor(nn.Module):
     ) -> None:
         """Make the layers; at first they give about 0, the middle of each joint."""
         super().__init__()
-        self.aims = posture_gain > 0
         self.posture_gain = posture_gain
         self.mean = tanh_layers(inputs, hidden, actions, gain=0.01)
         self.register_buffer("log_std", torch.zeros(actions))
@@ -56,7 +55,7 @@ class Actor(nn.Module):
             target: The joint targets [N, A] in [-1, 1]; unused without `posture_gain`.
         """
         mean = self.mean(aligned)
-        if self.aims:
+        if self.posture_gain > 0:
             mean = self.posture_gain * (mean - target)
         std = self.log_std.exp().expand_as(mean)
         return Normal(mean, std, validate_args=False)

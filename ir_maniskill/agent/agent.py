@@ -1,66 +1,55 @@
 """Agent: the paper's boxes wired together."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.distributions import Normal
 
+from ir_maniskill.agent import language_system
 from ir_maniskill.agent.actor import Actor, tanh_layers
 from ir_maniskill.agent.alignment import Alignment
 from ir_maniskill.agent.config import AgentConfig
 from ir_maniskill.agent.critic import Critic, Standardize
-from ir_maniskill.agent.language_system import LanguageSystem
 from ir_maniskill.agent.perceptual_system import BodySense, PaperVision, PatchVision
-from ir_maniskill.environment.state import State
+from ir_maniskill.checks import require
+from ir_maniskill.environment.senses import State
+from ir_maniskill.environment.senses import entries as entries_of
 
 
 @dataclass(frozen=True)
 class StateSpec:
     """Shapes of the state s_t and of the action a_t."""
 
-    tokens: int
-    """L, tokens of a sentence."""
-    frames: int
-    """S, stacked observations."""
-    cameras: int
-    """K, cameras; 0 without images."""
-    height: int
-    """Height of an image [pixel]."""
-    width: int
-    """Width of an image [pixel]."""
-    joints: int
-    """J, joints felt by proprioception."""
-    fingers: int
-    """F, fingers that feel touch."""
-    privileged: int
-    """P, numbers of the simulator's own state; 0 if it is not given."""
+    shapes: dict[str, tuple[int, ...]]
+    """Shape of each entry of the state but for N, e.g. {"touch": (3, 6)}."""
     actions: int
     """A, numbers of an action."""
 
     @classmethod
     def of(cls, state: State, actions: int) -> "StateSpec":
         """Return the shapes of a state."""
-        frames, joints = state["proprioception"].shape[1:]
-        cameras = height = width = 0
-        if "images" in state:
-            cameras, height, width = state["images"].shape[2:5]
-        privileged = state["privileged"].shape[1] if "privileged" in state else 0
-        tokens, fingers = state["instruction"].shape[1], state["touch"].shape[2]
-        image = (cameras, height, width)
-        return cls(tokens, frames, *image, joints, fingers, privileged, actions)
+        return cls({k: tuple(v.shape[1:]) for k, v in state.items()}, actions)
 
-    def require(self, state: State, needed: Iterable[str]) -> None:
-        """Raise ValueError unless the state has these shapes in the fields needed."""
-        got = StateSpec.of(state, self.actions)
-        for name in needed:
-            if getattr(got, name) != getattr(self, name):
+    @classmethod
+    def from_data(cls, data: dict[str, Any]) -> "StateSpec":
+        """Return the spec from plain JSON data (`dataclasses.asdict`)."""
+        shapes = {name: tuple(map(int, s)) for name, s in data["shapes"].items()}
+        return cls(shapes, int(data["actions"]))
+
+    def require(self, state: State, entries: Iterable[str]) -> None:
+        """Raise ValueError unless the state has these entries in these shapes."""
+        for name in entries:
+            got, expected = state.get(name), self.shapes[name]
+            if got is None or tuple(got.shape[1:]) != expected:
+                found = "nothing" if got is None else tuple(got.shape[1:])
                 raise ValueError(
-                    f"{name} of the state: got {getattr(got, name)}, but this agent "
-                    f"was made for {getattr(self, name)}; make the environment with "
-                    "the camera size, obs_mode and frames of the agent's config"
+                    f"{name} of the state: got {found}, but this agent was made for "
+                    f"{expected}; make the environment with the robot, camera size, "
+                    "obs_mode and frames of the agent's config"
                 )
 
 
@@ -87,28 +76,34 @@ class StateEncoder(nn.Module):
     def __init__(
         self, config: AgentConfig, spec: StateSpec, senses: tuple[str, ...]
     ) -> None:
-        """Make the parts that the senses need."""
+        """Make the parts that the senses need.
+
+        Raises:
+            ConfigError: A sense is not among what the env observes.
+        """
         super().__init__()
-        self.body_keys = self._body_keys(config, senses)
-        self.language = LanguageSystem(
-            config.vocabulary,
-            spec.tokens,
-            layers=config.language_layers,
-            heads=config.language_heads,
-            width=config.language_width,
-        )
+        entries = entries_of(senses)
+        for name in entries:
+            observed = ", ".join(spec.shapes)
+            require(
+                name in spec.shapes, "senses", senses, f"those observed: {observed}"
+            )
+        self.sensed = tuple(entries)
+        """Entries of the state that it needs, beside the sentence."""
+        self.language = language_system.make(config)
         self.width = self.language.width
         """Size of B_t."""
-        self.vision = self._vision(config, spec) if "vision" in senses else None
-        if self.vision is not None:
+        self.vision: nn.Module | None = None
+        if "images" in entries:
+            self.vision = self._vision(config, spec.shapes["images"])
             self.width += config.vision_width
-        self.standardize = Standardize(spec.privileged) if "state" in senses else None
-        joints, fingers = spec.frames * spec.joints, spec.frames * spec.fingers
-        sizes = {"proprioception": joints, "target": joints, "touch": fingers}
-        sizes["privileged"] = spec.privileged
-        self.body = None
-        if self.body_keys:
-            inputs = sum(sizes[key] for key in self.body_keys)
+        self.standardize: Standardize | None = None
+        if "privileged" in entries:
+            self.standardize = Standardize(*spec.shapes["privileged"])
+        self.felt = tuple(n for n in entries if n != "images")
+        self.body: BodySense | None = None
+        if self.felt:
+            inputs = sum(math.prod(spec.shapes[name]) for name in self.felt)
             patches = config.vision == "patches"
             self.body = BodySense(inputs, config.body_width, normalize=patches)
             self.width += config.body_width
@@ -116,42 +111,29 @@ class StateEncoder(nn.Module):
 
     def forward(self, state: State) -> Tensor:
         """Return B_t [N, D] = [G_t, V_t, H_t]."""
-        embeddings = [self.language(state["instruction"])]
+        said = self.language(*(state[name] for name in self.language.reads))
+        embeddings = [said]
         if self.vision is not None:
-            embeddings.append(self.vision(state["images"], embeddings[0]))
+            embeddings.append(self.vision(state["images"], said))
         if self.body is not None:
-            embeddings.append(
-                self.body(*(self._sense(state, k) for k in self.body_keys))
-            )
+            embeddings.append(self.body(*(self._sense(state, k) for k in self.felt)))
         return self.alignment(*embeddings)
 
-    def _sense(self, state: State, key: str) -> Tensor:
-        if key == "privileged" and self.standardize is not None:
-            return self.standardize(state[key])
-        return state[key]
+    def _sense(self, state: State, name: str) -> Tensor:
+        if name == "privileged" and self.standardize is not None:
+            return self.standardize(state[name])
+        return state[name]
 
-    @staticmethod
-    def _body_keys(config: AgentConfig, senses: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the entries of the state that the body senses consist of."""
-        keys: dict[str, tuple[str, ...]]
-        keys = {"state": ("privileged",), "touch": ("touch",)}
-        felt = (
-            ("proprioception", "target") if config.sees_target else ("proprioception",)
-        )
-        keys["proprioception"] = felt
-        return tuple(key for sense in senses for key in keys.get(sense, ()))
-
-    @staticmethod
-    def _vision(config: AgentConfig, spec: StateSpec) -> nn.Module:
+    def _vision(self, config: AgentConfig, shape: tuple[int, ...]) -> nn.Module:
+        frames, cameras, height, width, _ = shape
         if config.vision == "paper":
-            return PaperVision(spec.frames, spec.cameras, config.vision_width)
-        language = spec.tokens * config.language_width
+            return PaperVision(frames, cameras, config.vision_width)
         return PatchVision(
-            spec.frames,
-            (spec.cameras, spec.height, spec.width),
+            frames,
+            (cameras, height, width),
             config.vision_channels,
             config.vision_width,
-            film_width=language if config.film else 0,
+            film_width=self.language.width,
         )
 
 
@@ -188,19 +170,20 @@ class Agent(nn.Module):
                 self.locator = tanh_layers(self.encoder.width, (128,), 3, gain=0.1)
 
     def _make_critic(self, config: AgentConfig, spec: StateSpec) -> None:
+        senses = config.senses or ()
         if config.critic == "asymmetric":
-            if not spec.privileged:
+            if "privileged" not in spec.shapes:
                 raise ValueError(
                     "the asymmetric critic reads the simulator's state, but the "
                     "observation has none; got an obs_mode without it, expected "
                     "'rgb+state_dict' or 'state_dict'"
                 )
-            senses = ("proprioception", "touch", "state")
-            self.critic_encoder = StateEncoder(config, spec, senses)
-        elif config.critic == "separate":
-            self.critic_encoder = StateEncoder(config, spec, config.senses or ())
-        width = (self.critic_encoder or self.encoder).width
-        self.critic = Critic(width, config.hidden)
+            # What the robot feels, whether the actor does or not, and senses of one's
+            # own: only pictures are left out, which the state stands for.
+            every = ("proprioception", "target", "touch", "state", *senses)
+            senses = tuple(sense for sense in dict.fromkeys(every) if sense != "vision")
+        self.critic_encoder = StateEncoder(config, spec, senses)
+        self.critic = Critic(self.critic_encoder.width, config.hidden)
 
     def act(self, state: State, deterministic: bool = False) -> Act:
         """Return an action for each state: sampled, or the policy's mean."""
@@ -208,25 +191,24 @@ class Agent(nn.Module):
         policy = self._distribution(state, aligned)
         action = policy.mean if deterministic else policy.sample()
         log_prob = policy.log_prob(action).sum(-1)
-        return Act(action, log_prob, self._value(state, aligned))
+        return Act(action, log_prob, self.value(state))
 
     @torch.no_grad()
     def policy(self, state: State) -> Tensor:
         """Return the policy's mean action [N, A] in [-1, 1], without any noise."""
-        needed = ["tokens", "frames", "joints", "fingers"]
-        if self.encoder.vision is not None:
-            needed += ["cameras", "height", "width"]
-        if self.encoder.standardize is not None:
-            needed += ["privileged"]
-        self.spec.require(state, needed)
+        self.spec.require(state, self.encoder.sensed)
         device = self.actor.log_std.device
         here = {key: value.to(device) for key, value in state.items()}
         return self._distribution(here, self.encoder(here)).mean.clamp(-1, 1)
 
     def value(self, state: State) -> Tensor:
         """Return the value of each state [N]."""
-        aligned = self.encoder(state) if self.critic_encoder is None else None
-        return self._value(state, aligned)
+        if self.critic is None or self.critic_encoder is None:
+            raise RuntimeError(
+                "this agent was loaded as a policy, without its critic: use `policy`, "
+                "or load a complete checkpoint"
+            )
+        return self.critic(self.critic_encoder(state))
 
     def evaluate_actions(self, state: State, action: Tensor) -> Judgement:
         """Return how likely the actions [N, A] are now, and the states' values."""
@@ -235,7 +217,7 @@ class Agent(nn.Module):
         return Judgement(
             policy.log_prob(action).sum(-1),
             policy.entropy().sum(-1),
-            self._value(state, aligned),
+            self.value(state),
             None if self.locator is None else self.locator(aligned),
         )
 
@@ -247,13 +229,3 @@ class Agent(nn.Module):
 
     def _distribution(self, state: State, aligned: Tensor) -> Normal:
         return self.actor(aligned, state["target"][:, 0])
-
-    def _value(self, state: State, aligned: Tensor | None) -> Tensor:
-        if self.critic is None:
-            raise RuntimeError(
-                "this agent was loaded as a policy, without its critic: use `policy`, "
-                "or load a complete checkpoint"
-            )
-        if self.critic_encoder is not None:
-            aligned = self.critic_encoder(state)
-        return self.critic(aligned)

@@ -1,10 +1,62 @@
-"""Language System: the sentence i_t becomes G_t."""
+"""Language System: the sentence i_t becomes G_t.
+
+Legend: N envs, L tokens, B bytes, M different sentences, D units of a token.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ir_maniskill.agent.config import AgentConfig
+from ir_maniskill.checks import require
 from ir_maniskill.experiment import PAD
+
+
+class LanguageEncoder(nn.Module):
+    """Base of what reads sentences; one of your own is a subclass and `register`.
+
+    It is called with the entries of the state that it `reads`, and returns G_t
+    [N, width]. Whatever tensors it holds must be in its `state_dict`: where a policy is
+    loaded they come from the file.
+    """
+
+    reads: ClassVar[tuple[str, ...]] = ("instruction",)
+    """"instruction" are token ids [N, L], "text" the sentence's bytes [N, B], which
+    `environment.senses.read_text` turns into strings."""
+    width: int
+    """Size of G_t."""
+
+    def __init__(self, config: AgentConfig) -> None:
+        """Make what is still untrained; `config` has the words and sizes."""
+        super().__init__()
+
+
+_ENCODERS: dict[str, type[LanguageEncoder]] = {}
+
+
+def register(name: str, encoder: type[LanguageEncoder]) -> None:
+    """Make an encoder known as a value of `AgentConfig.language`.
+
+    Raises:
+        ConfigError: Another one has that name.
+    """
+    free = _ENCODERS.setdefault(name, encoder) is encoder
+    require(free, "name of a language encoder", name, "one that is not taken")
+
+
+def make(config: AgentConfig) -> LanguageEncoder:
+    """Return the untrained encoder that the config names.
+
+    Raises:
+        ConfigError: There is none of that name.
+    """
+    name, known = config.language, ", ".join(map(repr, _ENCODERS))
+    require(name in _ENCODERS, "language", name, f"one of {known}")
+    return _ENCODERS[name](config)
 
 
 class EncoderLayer(nn.Module):
@@ -39,31 +91,60 @@ class EncoderLayer(nn.Module):
         return self.feed_forward_norm(tokens + self.feed_forward(tokens))
 
 
-class LanguageSystem(nn.Module):
-    """G_t = Encoder(i_t): a small transformer over the tokens of the sentence."""
+class TokenTransformer(LanguageEncoder):
+    """G_t = Encoder(i_t): the paper's small transformer over the tokens.
 
-    def __init__(
-        self, vocabulary: int, length: int, *, layers: int, heads: int, width: int
-    ) -> None:
-        """Make the encoder of sentences of up to `length` tokens."""
-        super().__init__()
-        self.width = length * width
-        """Size of G_t: the outputs of all tokens, one after the other."""
-        self.words = nn.Embedding(vocabulary, width, padding_idx=PAD)
-        self.positions = nn.Parameter(0.1 * torch.randn(length, width))
-        self.layers = nn.ModuleList(EncoderLayer(width, heads) for _ in range(layers))
+    G_t has the outputs of all tokens one after the other, as in the paper, and zeros
+    for those up to `language_length` that a sentence does not have.
+    """
+
+    def __init__(self, config: AgentConfig) -> None:
+        """Make the untrained layers."""
+        super().__init__(config)
+        self.length, width = config.language_length, config.language_width
+        self.width = self.length * width
+        self.words = nn.Embedding(len(config.vocabulary), width, padding_idx=PAD)
+        self.positions = nn.Parameter(0.1 * torch.randn(self.length, width))
+        self.layers = nn.ModuleList(
+            EncoderLayer(width, config.language_heads)
+            for _ in range(config.language_layers)
+        )
 
     def forward(self, instruction: Tensor) -> Tensor:
-        """Return G_t [N, L*D] of the token ids [N, L].
+        """Return G_t [N, width] of the token ids [N, L].
 
         A batch repeats few sentences many times, so each is encoded only once.
+
+        Raises:
+            ValueError: A sentence is too long, or has ids that no word has.
         """
         sentences, which = torch.unique(instruction, dim=0, return_inverse=True)
-        return self._encode(sentences).index_select(0, which)
+        return self._encode(self._fitting(sentences)).index_select(0, which)
+
+    def _fitting(self, sentences: Tensor) -> Tensor:
+        """Return the sentences [M, L] without padding beyond what can be read."""
+        if sentences[:, self.length :].any():  # PAD is 0
+            longest = int((sentences != PAD).sum(1).max())
+            raise ValueError(
+                f"instruction: got a sentence of {longest} tokens, expected at most "
+                f"{self.length}; say it in fewer words, or train an agent with a "
+                "larger language_length"
+            )
+        words = self.words.num_embeddings
+        if sentences.numel() and sentences.max() >= words:
+            raise ValueError(
+                f"instruction: got the token id {int(sentences.max())}, expected one "
+                f"of the {words} that this agent learned; its task has other words"
+            )
+        return sentences[:, : self.length]
 
     def _encode(self, sentences: Tensor) -> Tensor:
         present = sentences != PAD  # [M, L]
-        tokens = self.words(sentences) + self.positions  # [M, L, D]
+        tokens = self.words(sentences) + self.positions[: sentences.shape[1]]
         for layer in self.layers:
-            tokens = layer(tokens, present)
-        return (tokens * present[..., None]).flatten(1)  # [M, L*D]
+            tokens = layer(tokens, present)  # [M, L, D]
+        flat = tokens.masked_fill(~present[..., None], 0).flatten(1)
+        return functional.pad(flat, (0, self.width - flat.shape[1]))
+
+
+register("tokens", TokenTransformer)

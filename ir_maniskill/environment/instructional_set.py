@@ -1,6 +1,6 @@
 """Instructional Set: sentences i_t, their tokens and their goals (Sec. III-A).
 
-Legend: I instructions, N envs, L tokens, F fingers, C objects.
+Legend: I instructions, N envs, L tokens, B bytes, F fingers, C objects.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ir_maniskill.experiment import PAD, Experiment, tokenize
+from ir_maniskill.environment.senses import text_of, tokens_of
+from ir_maniskill.experiment import Experiment
 from ir_maniskill.goals import DIRECTIONS, Goal, GoalError, Measure, Ref
 from ir_maniskill.snapshot import Snapshot
 
@@ -29,6 +30,7 @@ class InstructionalSet:
     Attributes:
         sentences: The I sentences.
         tokens: Token ids, padded with 0 to the longest sentence [I, L] int64.
+        text: The sentences in UTF-8, padded likewise [I, B] uint8.
         goals: The I goals, ready to be measured.
     """
 
@@ -46,10 +48,8 @@ class InstructionalSet:
             GoalError: A goal asks for a hand that the robot does not have.
         """
         self.sentences = experiment.sentences
-        rows = [tokenize(s, experiment.vocabulary) for s in self.sentences]
-        length = max(map(len, rows))
-        padded = [row + [PAD] * (length - len(row)) for row in rows]
-        self.tokens = torch.tensor(padded, device=device)  # [I, L]
+        self.tokens = tokens_of(self.sentences, experiment.vocabulary).to(device)
+        self.text = text_of(self.sentences).to(device)
         goals = [instruction.goal for instruction in experiment.instructions]
         self.goals = GoalTable(goals, hands, device)
 

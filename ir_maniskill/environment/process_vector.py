@@ -23,6 +23,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
+from ir_maniskill.environment import senses
 from ir_maniskill.environment.arguments import actions_of, options_of, seeds_of
 from ir_maniskill.environment.host_tensor import HostTensor
 from ir_maniskill.environment.shared_rows import SharedRows, Tree, map_leaves, reserve
@@ -126,7 +127,8 @@ class ProcessVectorEnv(VectorEnv):
 
     def _make(self, env_kwargs: dict[str, Any]) -> None:
         """Have the envs made, learn their spaces and hand out the shared memory."""
-        makes = [(self.experiment, rows, env_kwargs) for rows in self._rows]
+        own = senses.registered()
+        makes = [(self.experiment, own, rows, env_kwargs) for rows in self._rows]
         record, *spaces = self._command("make", makes)[0]
         self.single_observation_space, self.single_action_space = spaces
         self.observation_space, self.action_space = (

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.doctor import require_vulkan
-from ir_maniskill.environment import reward_generator, table_scene
+from ir_maniskill.environment import reward_generator, senses, table_scene
 from ir_maniskill.environment.arguments import instruction_indices
 from ir_maniskill.environment.bodies import poses, velocities
 from ir_maniskill.environment.instructional_set import GoalBatch, InstructionalSet
@@ -342,28 +342,10 @@ class TouchEnv(RenderedEnv):
     # -- Observation o_t -------------------------------------------------------------
 
     def _get_obs_agent(self) -> dict[str, Tensor]:
-        obs = self.agent.get_proprioception()
-        if self.obs_mode_struct.use_state:
-            obs["velocity"] = self.agent.joint_velocity()
-        return obs
+        return self.agent.get_proprioception() | senses.observe(self, "agent", {})
 
     def _get_obs_extra(self, info: dict[str, Tensor]) -> dict[str, Tensor]:
-        index = self.instruction_index
-        obs = {
-            "touch": info["contact"].any(dim=2).float(),  # [N, F]
-            "instruction": self.instructional_set.tokens.index_select(0, index),
-        }
-        if self.obs_mode_struct.use_state:
-            serves = self.measure.serves  # [N, F, C]
-            obs |= {
-                "object_position": poses(self.objects)[..., :3],  # [N, C, 3]
-                "finger_position": self.agent.finger_position(),  # [N, F, 3]
-                "target_object": serves.any(dim=1).float(),  # [N, C]
-                "target_finger": serves.any(dim=2).float(),  # [N, F]
-                "gap": self.measure.gap[:, None],  # [N, 1]
-                "wrong_once": info["wrong_once"].float()[:, None],  # [N, 1]
-            }
-        return obs
+        return senses.observe(self, "extra", info)
 
     # -- Reward r_t ------------------------------------------------------------------
 

@@ -16,6 +16,8 @@ import gymnasium as gym
 import numpy as np
 import torch
 
+from ir_maniskill.environment import senses
+from ir_maniskill.environment.senses import Term
 from ir_maniskill.environment.shared_rows import SharedRows, record_of
 from ir_maniskill.experiment import Experiment
 
@@ -49,11 +51,15 @@ class _Worker:
     def __init__(self, pipe: Connection) -> None:
         self._pipe = pipe
 
-    def make(self, argument: tuple[Experiment, list[int], dict[str, Any]]) -> Any:
+    def make(
+        self, argument: tuple[Experiment, tuple[Term, ...], list[int], dict[str, Any]]
+    ) -> Any:
         """Make the envs; the first worker describes them for all."""
         from ir_maniskill.registration import register
 
-        experiment, self._rows, kwargs = argument
+        experiment, terms, self._rows, kwargs = argument
+        for term in terms:
+            senses.register(term)
         register(experiment)
         self._envs = [gym.make(experiment.id, **kwargs) for _ in self._rows]
         # ManiSkill collects garbage whenever it rebuilds a scene, which seeded resets

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from ir_maniskill.environment.state import State, StateStack
+from ir_maniskill.environment.senses import State, StateStack
 from ir_maniskill.environment.vector import VectorEnv, info_of_step, make_vec
 from ir_maniskill.files import replacing
 

@@ -26,7 +26,7 @@ from matplotlib import font_manager
 from PIL import Image, ImageDraw, ImageFont
 
 from ir_maniskill.environment.robots.robot import Robot
-from ir_maniskill.environment.state import CAMERAS, StateStack
+from ir_maniskill.environment.senses import StateStack, cameras
 from ir_maniskill.environment.table_scene import view
 from ir_maniskill.environment.touch_env import CONTROL_FREQ
 from ir_maniskill.evaluation.evaluate import Policy, choose_instructions, one_thread
@@ -43,7 +43,7 @@ VIEW: Box = (32, 100, 836, 540)
 TIMELINE: Box = (32, 664, 836, 24)
 """One cell for each step, below the human view."""
 PICTURES: tuple[Box, Box] = ((900, 124, 166, 332), (1082, 124, 166, 332))
-"""The policy's top and front pictures."""
+"""The policy's pictures; of more cameras the first two."""
 HANDS: Box = (900, 480, 348, 128)
 """The touch lights."""
 LEGEND = (902, 60)
@@ -72,8 +72,8 @@ class Snapshot:
 
     view: np.ndarray
     """Human view [H, W, 3] uint8."""
-    cameras: tuple[np.ndarray, ...]
-    """The policy's pictures, top and front, each [h, w, 3] uint8."""
+    cameras: dict[str, np.ndarray]
+    """What the policy's cameras see, by their names, each [h, w, 3] uint8."""
     instruction: str
     """The sentence."""
     hands: Mapping[str, tuple[str, ...]]
@@ -200,9 +200,8 @@ def _picture(tensor: Any) -> np.ndarray:
     return array[0] if array.ndim == 4 else array
 
 
-def _camera_pictures(obs: dict[str, Any]) -> tuple[np.ndarray, ...]:
-    sensors = obs.get("sensor_data", {})
-    return tuple(_picture(sensors[name]["rgb"]) for name in CAMERAS if name in sensors)
+def _camera_pictures(obs: dict[str, Any]) -> dict[str, np.ndarray]:
+    return {name: _picture(obs["sensor_data"][name]["rgb"]) for name in cameras(obs)}
 
 
 # -- Drawing -------------------------------------------------------------------------
@@ -212,9 +211,9 @@ def draw(snapshot: Snapshot) -> np.ndarray:
     """Draw a frame [720, 1280, 3] uint8."""
     page = _page().copy()
     _paste(page, snapshot.view, VIEW, radius=14)
-    pictures = zip(snapshot.cameras, PICTURES, strict=False)
+    pictures = zip(snapshot.cameras.values(), PICTURES, strict=False)
     boxes = [_fit(picture, box) for picture, box in pictures]
-    for picture, box in zip(snapshot.cameras, boxes, strict=False):
+    for picture, box in zip(snapshot.cameras.values(), boxes, strict=False):
         _paste(page, picture, box, radius=10)
     canvas = ImageDraw.Draw(page)
     font = _fitting(snapshot.instruction, LEGEND[0] - 60, 34)
@@ -255,9 +254,9 @@ def _page() -> Image.Image:
 
 
 def _label_cameras(
-    canvas: ImageDraw.ImageDraw, pictures: Sequence[np.ndarray], boxes: Sequence[Box]
+    canvas: ImageDraw.ImageDraw, pictures: dict[str, np.ndarray], boxes: Sequence[Box]
 ) -> None:
-    for camera, picture, box in zip(CAMERAS, pictures, boxes, strict=False):
+    for (camera, picture), box in zip(pictures.items(), boxes, strict=False):
         x, y, width, _ = box
         name = camera.replace("_", " ").upper()
         canvas.text((x + 1, y - 10), name, FAINT, _font(12), anchor="ls")

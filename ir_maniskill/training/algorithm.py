@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ir_maniskill.agent.agent import Agent
-from ir_maniskill.environment.state import State
+from ir_maniskill.environment.senses import State
 from ir_maniskill.training.config import TrainConfig
 
 

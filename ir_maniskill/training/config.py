@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
-from ir_maniskill.agent.config import AgentConfig
+from ir_maniskill.agent.config import AgentConfig, from_version_1
 from ir_maniskill.checks import ConfigError, require, require_choice
 from ir_maniskill.environment.reward_generator import RewardWeights
 
@@ -223,9 +223,8 @@ CONFIGS: dict[str, TrainConfig] = {
         eval_episodes=30,
         agent=AgentConfig(
             senses=None,
-            sees_target=False,
+            language_length=5,
             vision="paper",
-            film=False,
             critic="separate",
             auxiliary_weight=0.0,
         ),
@@ -316,7 +315,7 @@ def _from_version_1(old: dict[str, Any]) -> dict[str, Any]:
         ) from error
     # The policy that was kept acts with the gain of the end.
     gain = agent.pop("posture_gain_final", None) or agent.get("posture_gain", 0.0)
-    new |= {"agent": agent | {"posture_gain": gain}, "ppo": ppo}
+    new |= {"agent": from_version_1(agent | {"posture_gain": gain}), "ppo": ppo}
     _drop(new, ("eval_seed", "stop_at_success"))
     _drop(ppo, ("value_weight", "entropy_weight", "normalize_reward", "max_kl"))
     if new.get("reward_mode") == "normalized_dense":

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ir_maniskill.agent.agent import Agent, StateSpec
-from ir_maniskill.environment.state import State
+from ir_maniskill.environment.senses import State
 from ir_maniskill.training import distributed
 from ir_maniskill.training.algorithm import (
     Algorithm,

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ir_maniskill.agent.agent import Act
-from ir_maniskill.environment.state import State
+from ir_maniskill.environment.senses import State
 from ir_maniskill.training import distributed
 
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ir_maniskill.agent.agent import Agent
-from ir_maniskill.environment.state import State, StateStack
+from ir_maniskill.environment.senses import State, StateStack
 from ir_maniskill.environment.vector import VectorEnv, info_of_step
 from ir_maniskill.evaluation.evaluate import EvaluationReport, evaluate_policy
 from ir_maniskill.training import checkpoint, distributed

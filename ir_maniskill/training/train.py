@@ -7,12 +7,11 @@ import dataclasses
 import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 
 from ir_maniskill import experiment as catalog
-from ir_maniskill.agent.config import Sense
 from ir_maniskill.checks import ConfigError, require
 from ir_maniskill.environment.vector import VectorEnv, make_vec
 from ir_maniskill.experiment import Experiment
@@ -119,8 +118,8 @@ def run(
 
 def for_experiment(config: TrainConfig, experiment: Experiment) -> TrainConfig:
     """Return the config with what the experiment decides: senses and vocabulary."""
-    senses = config.agent.senses or tuple(cast("tuple[Sense, ...]", experiment.senses))
-    words = len(experiment.vocabulary)
+    senses = config.agent.senses or experiment.senses
+    words = experiment.vocabulary
     agent = dataclasses.replace(config.agent, senses=senses, vocabulary=words)
     return dataclasses.replace(config, agent=agent)
 

@@ -1,0 +1,293 @@
+"""Senses: the one list of what is perceived, and the state s_t made of it.
+
+The env observes what the terms of this list measure, `StateStack` stacks them, and the
+agent's encoders read those that `AgentConfig.senses` names. A sense of one's own is one
+`register(Term(...))`, in a module that can be imported, so that worker processes get it
+too. Cameras are the env's: all that give colors are seen.
+
+Legend: N envs, S stacked observations, K cameras, H x W pixels, J joints, F fingers,
+C objects, L tokens, B bytes, P privileged numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from ir_maniskill.environment.bodies import positions
+from ir_maniskill.experiment import PAD, tokenize
+
+Observation = dict[str, Any]
+"""o_t of N envs in an image or state_dict mode, nested as ManiSkill does."""
+
+State = dict[str, Tensor]
+"""s_t of N envs by the names of the terms; those of the simulator's own state are side
+by side in "privileged" [N, P]."""
+
+Encoder = Literal["language", "vision", "body", "privileged", "none"]
+Part = Literal["agent", "extra"]
+Info = dict[str, Tensor]
+Measure = Callable[[Any, Info], Tensor]
+
+
+@dataclass(frozen=True)
+class Term:
+    """One entry of the observation and of the state."""
+
+    name: str
+    """Its name in both."""
+    encoder: Encoder
+    """What of the agent reads it: the Language System; the Perceptual System's vision
+    or its body senses; "privileged", the same but standardized, for what only the
+    simulator knows; or "none", for what a loss compares with."""
+    shape: str
+    """What it is for each env, e.g. "J" or "K, H, W, 3"."""
+    measure: Measure | None = None
+    """Returns it [N, shape], of the env and its info; None: the robot gives it with its
+    proprioception, or `read` finds it."""
+    sense: str = ""
+    """What `AgentConfig.senses` calls it; "" is its name."""
+    stacked: bool = False
+    """Whether the state has its last S values [N, S, shape], the newest first."""
+    part: Part = "extra"
+    """Where the observation has it; of "agent" the info is not known yet."""
+    flat: bool = True
+    """Whether flat observations (obs_mode "state") have it, too."""
+    read: Callable[[Observation], Tensor | None] | None = None
+    """Finds it in an observation, if it is not simply there."""
+
+    def find(self, obs: Observation) -> Tensor | None:
+        """Return it from an observation; None: it is not there."""
+        if self.read is not None:
+            return self.read(obs)
+        return obs.get(self.part, {}).get(self.name)
+
+
+def cameras(obs: Observation) -> tuple[str, ...]:
+    """Return the names of the K cameras that see colors, as they are in "images".
+
+    Their order follows from the names alone: dicts may be sorted on their way.
+    """
+    sensors = obs.get("sensor_data", {})
+    named = (name for name, seen in sensors.items() if "rgb" in seen)
+    return tuple(sorted(named, reverse=True))  # the top camera before the front one
+
+
+def _images(obs: Observation) -> Tensor | None:
+    pictures = [obs["sensor_data"][name]["rgb"] for name in cameras(obs)]
+    sizes = {tuple(picture.shape[-3:-1]) for picture in pictures}
+    if len(sizes) > 1:
+        raise ValueError(
+            f"sizes of the cameras {cameras(obs)}: got {sorted(sizes)}, expected one "
+            "height and width [pixel] for all; change their configs (sensor_configs)"
+        )
+    return torch.stack(pictures, dim=1) if pictures else None
+
+
+def _named_position(obs: Observation) -> Tensor | None:
+    """Return the middle of the objects that the sentence asks about [N, 3] [m]."""
+    extra = obs["extra"]
+    if "object_position" not in extra:
+        return None
+    named = extra["target_object"][..., None]  # [N, C, 1]
+    return (extra["object_position"] * named).sum(1) / named.sum(1).clamp_min(1)
+
+
+def _touched(_: Any, info: Info) -> Tensor:
+    return info["contact"].any(dim=2).float()
+
+
+def _wrong_once(_: Any, info: Info) -> Tensor:
+    return info["wrong_once"].float()[:, None]
+
+
+def _of_sentence(table: str) -> Measure:
+    """Return what finds the active sentence's row of a table [I, ...]."""
+    return lambda env, _: getattr(env.instructional_set, table)[env.instruction_index]
+
+
+def _privileged(name: str, shape: str, measure: Measure, part: Part = "extra") -> Term:
+    return Term(name, "privileged", shape, measure, sense="state", part=part)
+
+
+_TERMS = [
+    Term("images", "vision", "K, H, W, 3", sense="vision", stacked=True, read=_images),
+    Term("proprioception", "body", "J", stacked=True, part="agent"),
+    Term("target", "body", "J", stacked=True, part="agent"),
+    Term("touch", "body", "F", _touched, stacked=True),
+    Term("instruction", "language", "L", _of_sentence("tokens")),
+    Term("text", "language", "B", _of_sentence("text"), flat=False),
+    _privileged("velocity", "J", lambda env, _: env.agent.joint_velocity(), "agent"),
+    _privileged("object_position", "C, 3", lambda env, _: positions(env.objects)),
+    _privileged("finger_position", "F, 3", lambda env, _: env.agent.finger_position()),
+    _privileged("target_object", "C", lambda env, _: env.measure.serves.any(1).float()),
+    _privileged("target_finger", "F", lambda env, _: env.measure.serves.any(2).float()),
+    _privileged("gap", "1", lambda env, _: env.measure.gap[:, None]),
+    _privileged("wrong_once", "1", _wrong_once),
+    Term("named_position", "none", "3", read=_named_position),
+]
+_OURS = len(_TERMS)
+
+
+def available() -> tuple[str, ...]:
+    """Return what `AgentConfig.senses` may name."""
+    felt = [t for t in _TERMS if t.encoder in ("vision", "body", "privileged")]
+    return tuple(dict.fromkeys(t.sense or t.name for t in felt))
+
+
+def register(term: Term) -> Term:
+    """Add a sense of one's own, before envs are made; again: nothing happens.
+
+    Raises:
+        ValueError: Its name is taken, or no encoder for all comers would read it.
+    """
+    if term in _TERMS:
+        return term
+    if term.name in (t.name for t in _TERMS):
+        raise ValueError(f"name of a sense: got {term.name!r}, which is taken")
+    if term.encoder not in ("body", "privileged"):
+        raise ValueError(
+            f"encoder of {term.name!r}: got {term.encoder!r}, expected 'body' or "
+            "'privileged'"
+        )
+    _TERMS.append(term)
+    return term
+
+
+def registered() -> tuple[Term, ...]:
+    """Return the senses that were registered, for a worker process to do so too."""
+    return tuple(_TERMS[_OURS:])
+
+
+def observe(env: Any, part: Part, info: Info) -> dict[str, Tensor]:
+    """Return what the terms of a part of the observation measure in an env."""
+    mode = env.obs_mode_struct
+    return {
+        term.name: term.measure(env, info)
+        for term in _TERMS
+        if term.part == part
+        and term.measure is not None
+        and (mode.use_state or term.encoder != "privileged")
+        and (term.flat or not mode.state)
+    }
+
+
+def entries(senses: Iterable[str]) -> dict[str, Encoder]:
+    """Return which entries of the state these senses are, and what reads each."""
+    found: dict[str, Encoder] = {}
+    for sense in senses:
+        for term in _TERMS:
+            if sense == (term.sense or term.name):
+                joined = term.encoder == "privileged"
+                found["privileged" if joined else term.name] = term.encoder
+    return found
+
+
+# -- Sentences as tensors --------------------------------------------------------------
+
+
+def tokens_of(sentences: Sequence[str], vocabulary: tuple[str, ...]) -> Tensor:
+    """Return the token ids of sentences, padded to the longest [I, L] int64."""
+    return _padded([tokenize(s, vocabulary) for s in sentences], torch.int64)
+
+
+def text_of(sentences: Sequence[str]) -> Tensor:
+    """Return the UTF-8 bytes of sentences, padded with 0 to the longest [I, B] uint8.
+
+    So text goes wherever tensors do: between processes, into replays and recordings.
+    """
+    return _padded([list(s.encode()) for s in sentences], torch.uint8)
+
+
+def read_text(rows: Tensor) -> list[str]:
+    """Return the sentences that `text_of` wrote."""
+    return [bytes(row).rstrip(b"\0").decode() for row in rows.tolist()]
+
+
+def _padded(rows: list[list[int]], dtype: torch.dtype) -> Tensor:
+    length = max(map(len, rows))
+    return torch.tensor([r + [PAD] * (length - len(r)) for r in rows], dtype=dtype)
+
+
+# -- The state -------------------------------------------------------------------------
+
+
+def flatten(obs: Observation) -> State:
+    """Return one observation o_t as a flat dict, what is not there left out."""
+    state, privileged = {}, []
+    for term in _TERMS:
+        value = term.find(obs)
+        if value is not None and term.encoder == "privileged":
+            privileged.append(value.flatten(1))
+        elif value is not None:
+            state[term.name] = value
+    if privileged:
+        state["privileged"] = torch.cat(privileged, dim=1)
+    return state
+
+
+class StateStack:
+    """Turns observations into states s_t = [o_t, o_{t-1}, o_{t-2}] (Sec. III-A).
+
+    At the start of an episode the first observation fills the whole stack.
+    """
+
+    def __init__(self, frames: int = 3) -> None:
+        """Start with no history.
+
+        Args:
+            frames: Number of stacked observations S.
+        """
+        self.frames = frames
+        self._state: State = {}
+
+    def reset(self, obs: Observation) -> State:
+        """Start a new history in every env and return its state.
+
+        Args:
+            obs: The observation after a reset of all envs.
+        """
+        self._state = flatten(obs)
+        for name in _stacked(self._state):
+            self._state[name] = self._repeat(self._state[name])
+        return dict(self._state)
+
+    def push(self, obs: Observation, done: Tensor | None = None) -> State:
+        """Add an observation and return the state.
+
+        Args:
+            obs: The newest observation; where `done`, the first of a new episode.
+            done: Envs whose history starts anew [N] bool; none if left out.
+        """
+        self._state = self._pushed(obs, done)
+        return dict(self._state)
+
+    def peek(self, obs: Observation) -> State:
+        """Return the state that `push(obs)` would give, and change nothing.
+
+        Args:
+            obs: E.g. the final observation of an episode.
+        """
+        return self._pushed(obs, None)
+
+    def _pushed(self, obs: Observation, done: Tensor | None) -> State:
+        state = flatten(obs)
+        for name in _stacked(state):
+            newest = state[name]
+            stack = torch.cat([newest[:, None], self._state[name][:, :-1]], dim=1)
+            if done is not None and done.any():
+                stack[done] = self._repeat(newest[done])
+            state[name] = stack
+        return state
+
+    def _repeat(self, value: Tensor) -> Tensor:
+        """Fill a stack with one observation: [N, ...] -> [N, S, ...]."""
+        return value[:, None].repeat_interleave(self.frames, dim=1)
+
+
+def _stacked(state: State) -> list[str]:
+    return [term.name for term in _TERMS if term.stacked and term.name in state]

@@ -1,0 +1,158 @@
+"""Policy: a trained agent, ready to act on what envs observe."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ir_maniskill import experiment as catalog
+from ir_maniskill.agent.agent import Agent
+from ir_maniskill.environment.senses import (
+    Observation,
+    State,
+    StateStack,
+    text_of,
+    tokens_of,
+)
+from ir_maniskill.experiment import Experiment, warn_of_unknown
+from ir_maniskill.training import checkpoint
+from ir_maniskill.training.config import TrainConfig
+
+
+class Policy:
+    """A trained agent that acts without noise and remembers what it saw.
+
+    Example:
+        >>> import ir_maniskill
+        >>> policy = ir_maniskill.load_policy("NaoTouchCubeTriangle-v1")
+        >>> envs = ir_maniskill.make_vec(policy.env_id, 4, **policy.env_kwargs)
+        >>> obs, _ = envs.reset(seed=0)
+        >>> for _ in range(64):
+        ...     obs, reward, terminated, truncated, info = envs.step(policy.act(obs))
+        ...     policy.reset(terminated | truncated)
+
+    Attributes:
+        agent: The network.
+        config: How it was trained.
+        metadata: What its file says: `steps`, `evaluation`, `task`, ...
+    """
+
+    def __init__(
+        self, agent: Agent, config: TrainConfig, metadata: dict[str, Any]
+    ) -> None:
+        """Take what `training.checkpoint.load_policy` returns."""
+        self.agent, self.config, self.metadata = agent, config, metadata
+        self.reset()
+
+    @property
+    def env_id(self) -> str:
+        """The task that it was trained for."""
+        return self.config.env_id
+
+    @property
+    def vocabulary(self) -> tuple[str, ...]:
+        """The words that it knows."""
+        return self.config.agent.vocabulary
+
+    @property
+    def env_kwargs(self) -> dict[str, Any]:
+        """What an env must be made with for it to see what it was trained with."""
+        return self.config.env_kwargs(training=False)
+
+    def reset(self, done: Tensor | None = None) -> None:
+        """Forget what was seen, before an observation that begins an episode.
+
+        Args:
+            done: Envs whose next observation begins an episode [N] bool; None: all.
+        """
+        if done is None:
+            self._stack: StateStack | None = None
+        self._done = done
+
+    @torch.no_grad()
+    def act(
+        self, obs: Observation, sentences: str | Sequence[str] | None = None
+    ) -> Tensor:
+        """Return the actions [N, A] in [-1, 1] for the next observation of N envs.
+
+        Args:
+            obs: What a vector env, or a single one of `gym.make`, observes.
+            sentences: Said to it in place of the envs' own, one for all or N.
+
+        Raises:
+            ValueError: The observation lacks something, a sentence is too long, or N
+                is not that of the last observation: `reset()` comes before that.
+        """
+        state = self._see(obs)
+        rows = state["instruction"]
+        if sentences is not None:
+            said = [sentences] * len(rows) if isinstance(sentences, str) else sentences
+            state |= self.read(said)
+        return self.agent.policy(state).to(rows.device)
+
+    def read(self, sentences: Sequence[str]) -> State:
+        """Return the entries of the state that tell it these sentences."""
+        if "instruction" in self.agent.encoder.language.reads:
+            for sentence in sentences:
+                warn_of_unknown(sentence, self.vocabulary)
+        tokens = tokens_of(sentences, self.vocabulary)
+        return {"instruction": tokens, "text": text_of(sentences)}
+
+    def require_match(self, experiment: Experiment, robot: str | None = None) -> None:
+        """Raise unless it was trained for this task, as it is now, and this robot.
+
+        Raises:
+            MismatchError: Naming all that is different.
+        """
+        checkpoint.require_match(self.config, self.metadata, experiment, robot)
+
+    def _see(self, obs: Observation) -> State:
+        """Add an observation to the history, and return the state."""
+        done, self._done, count = self._done, None, len(obs["extra"]["instruction"])
+        if self._stack is None:
+            self._stack, self._count = StateStack(self.config.frames), count
+            return self._stack.reset(obs)
+        if count != self._count:
+            raise ValueError(
+                f"observation: got one of {count} envs, expected {self._count} as "
+                "before; call reset() before other envs are played"
+            )
+        return self._stack.push(obs, done)
+
+
+def load_policy(
+    id_or_path: str | Path, device: str | torch.device | None = None
+) -> Policy:
+    """Load a trained policy, to `act` on what envs observe; see `Policy`.
+
+    Args:
+        id_or_path: Id of a task, for the policy that ships with the package, or the
+            path of a policy or checkpoint file such as `runs/ID/best.safetensors`.
+        device: Where it computes; None: the GPU if there is one.
+
+    Raises:
+        CheckpointError: There is no such file, or it cannot be used.
+    """
+    path = shipped(str(id_or_path))
+    if not path.exists():
+        path = Path(id_or_path)
+    if not path.exists():
+        ids = ", ".join(name for name in catalog.available() if shipped(name).exists())
+        raise checkpoint.CheckpointError(
+            f"policy: got {str(id_or_path)!r}, expected an existing file, or a task "
+            f"whose policy ships with the package: {ids}"
+        )
+    agent, config, metadata = checkpoint.load_policy(path)
+    chosen = device or ("cuda" if torch.cuda.is_available() else "cpu")
+    return Policy(agent.to(chosen), config, metadata)
+
+
+def shipped(task_id: str) -> Path:
+    """Return where the policy of a task is, if it ships with the package."""
+    folder = resources.files("ir_maniskill.assets") / "policies"
+    return Path(str(folder / f"{task_id}.safetensors"))

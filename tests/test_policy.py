@@ -1,0 +1,107 @@
+"""A loaded policy acts on what envs observe, and remembers what it saw."""
+
+import logging
+
+import pytest
+import torch
+
+import ir_maniskill
+from ir_maniskill import experiment as catalog
+from ir_maniskill.environment.senses import StateStack, read_text
+from ir_maniskill.training.checkpoint import CheckpointError, MismatchError
+
+TASK = "NaoTouchCubeMulti-v1"
+
+
+@pytest.fixture(scope="module")
+def policy():
+    return ir_maniskill.load_policy(TASK, device="cpu")
+
+
+def observed(count=2):
+    """Return a random observation of `count` envs."""
+    color = torch.randint(256, (count, 64, 32, 3), dtype=torch.uint8)
+    return {
+        "agent": {
+            "proprioception": torch.rand(count, 26),
+            "target": torch.rand(count, 26),
+        },
+        "extra": {
+            "touch": torch.zeros(count, 6),
+            "instruction": torch.tensor([[3, 4, 5, 8, 2]] * count),
+        },
+        "sensor_data": {
+            "front_camera": {"rgb": color},
+            "top_camera": {"rgb": color.flip(0)},
+        },
+    }
+
+
+def test_it_acts_on_its_own_history(policy):
+    seen, stack = [observed() for _ in range(4)], StateStack(3)
+    policy.reset()
+    assert torch.equal(policy.act(seen[0]), policy.agent.policy(stack.reset(seen[0])))
+    assert torch.equal(policy.act(seen[1]), policy.agent.policy(stack.push(seen[1])))
+    done = torch.tensor([True, False])
+    policy.reset(done)
+    expected = policy.agent.policy(stack.push(seen[2], done))
+    assert torch.equal(policy.act(seen[2]), expected)
+    assert torch.equal(policy.act(seen[3]), policy.agent.policy(stack.push(seen[3])))
+    policy.reset()
+    assert torch.equal(policy.act(seen[0]), policy.agent.policy(stack.reset(seen[0])))
+
+
+def test_other_envs_come_after_a_reset(policy):
+    policy.reset()
+    policy.act(observed(2))
+    with pytest.raises(ValueError, match="got one of 3 envs, expected 2 as before"):
+        policy.act(observed(3))
+    policy.reset()
+    assert policy.act(observed(3)).shape == (3, 26)
+
+
+def test_it_can_be_told_any_sentence(policy, caplog):
+    obs = observed()
+
+    def told(sentences):
+        policy.reset()
+        return policy.act(obs, sentences)
+
+    obs["extra"]["instruction"] = torch.tensor([[3, 4, 6, 8, 2]] * 2)
+    red = told(None)
+    assert torch.equal(red, told("touch the RED cube."))
+    both = told(["Touch the red cube.", "Touch the blue cube."])
+    assert torch.allclose(both[0], red[0], atol=1e-5)
+    assert not torch.allclose(both[1], red[1], atol=1e-2)
+    assert read_text(policy.read(["à gauche"])["text"]) == ["à gauche"]
+    with caplog.at_level(logging.WARNING):
+        for _ in range(3):
+            told("Touch the pink cube.")
+    assert caplog.text.count("not in the vocabulary: pink") == 1
+    with pytest.raises(ValueError, match="sentence of 6 tokens, expected at most 5"):
+        told("Touch the very blue cube.")
+
+
+def test_it_says_what_it_was_trained_for(policy):
+    assert policy.env_id == TASK
+    assert policy.vocabulary == catalog.VOCABULARY
+    assert policy.env_kwargs["sensor_configs"]["width"] == 32
+    policy.require_match(catalog.get(TASK), "nao")
+    with pytest.raises(MismatchError, match="expected 'NaoTouchButtonMulti-v1'"):
+        policy.require_match(catalog.get("NaoTouchButtonMulti-v1"))
+
+
+def test_what_cannot_be_loaded_says_what_can():
+    with pytest.raises(CheckpointError, match=r"got 'Nao-v1', .*: .*CubeTriangle-v1"):
+        ir_maniskill.load_policy("Nao-v1")
+
+
+@pytest.mark.render
+def test_a_vector_of_envs_is_played(policy, multi_vec):
+    torch.manual_seed(0)
+    obs, _ = multi_vec.reset(seed=3_000_000, options={"instruction": 1})
+    policy.reset()
+    for _ in range(32):
+        obs, _, terminated, truncated, info = multi_vec.step(policy.act(obs))
+        policy.reset(terminated | truncated)
+    assert info["final_info"]["success_once"].all()
