@@ -1,8 +1,7 @@
-"""The robot as ManiSkill drives it: order, limits, modes, senses, stability."""
+"""The robot as ManiSkill drives it: order, limits, modes, senses."""
 
 import math
 from collections.abc import Iterator
-from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -10,12 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from ir_maniskill.environment.robots.nao import FINGERS, JOINTS, Nao
-from ir_maniskill.environment.robots.robot import Robot, RobotError, TargetController
+from ir_maniskill.environment.robots.controller import TargetController
+from ir_maniskill.environment.robots.nao import JOINTS
 from ir_maniskill.environment.touch_env import TouchEnv
 
 ABSOLUTE, DELTA = "pd_joint_pos", "pd_joint_target_delta_pos"
-TWO_DEGREES = math.radians(2)
 
 
 @pytest.fixture(scope="module", params=[ABSOLUTE, DELTA])
@@ -53,7 +51,7 @@ def test_actions_are_26_joints_all_left_then_all_right(env: TouchEnv) -> None:
 def test_an_action_with_nan_is_refused_and_leaves_the_targets(env: TouchEnv) -> None:
     env.reset(seed=0)
     before = env.agent.controller.target.clone()
-    with pytest.raises(ValueError, match="expected no NaN"):
+    with pytest.raises(ValueError, match="expected finite numbers"):
         env.step(action(env, LThumb2=math.nan))
     assert torch.equal(env.agent.controller.target, before)
 
@@ -159,27 +157,6 @@ def rows(values: list[float]) -> list[list[float]]:
     return [[value, value] for value in values]
 
 
-def test_joints_without_a_motors_limits_are_named(tmp_path: Path) -> None:
-    urdf = tmp_path / "stick.urdf"
-    urdf.write_text(
-        '<robot name="stick"><link name="base"/><link name="tip"/>'
-        '<joint name="slide" type="prismatic"><parent link="base"/><child link="tip"/>'
-        '<limit lower="0" upper="1"/></joint></robot>'
-    )
-
-    class Stick(Nao):
-        uid, urdf_path, joints = "stick", str(urdf), ("slide",)
-        _load_articulation = Robot._load_articulation
-
-    with pytest.raises(RobotError, match="in slide; .* position, effort and velocity"):
-        gym.make(
-            "NaoTouchButtonTriangle-v1",
-            robot_uids=Stick,
-            obs_mode="state",
-            render_backend="none",
-        )
-
-
 def test_drives_have_the_real_motors_limits(env: TouchEnv) -> None:
     joint = env.agent.robot.joints_map["LShoulderPitch"]._objs[0]
     assert joint.get_force_limit() == pytest.approx(1.329)
@@ -203,31 +180,8 @@ def test_keyframes_are_poses_the_robot_can_take(env: TouchEnv) -> None:
 def test_six_fingers_have_their_links_in_the_order_of_the_bits(env: TouchEnv) -> None:
     links = [[link.name for link in finger] for finger in env.agent.finger_links]
     assert [len(finger) for finger in links] == [3, 3, 2, 3, 3, 2]
-    for name, finger in zip(FINGERS, links, strict=True):
+    for name, finger in zip(env.agent.fingers, links, strict=True):
         assert all(link.startswith(name) for link in finger)
         assert finger == sorted(finger)
-
-
-def test_fingers_are_still_at_rest(env: TouchEnv) -> None:
-    obs, _ = env.reset(seed=0)
-    hold = obs["agent"]["target"][0].numpy()
-    hold = hold if env.control_mode == ABSOLUTE else np.zeros(26, np.float32)
-    for _ in range(20):
-        env.step(hold)
-    speeds = [env.step(hold)[0]["agent"]["velocity"].abs().max() for _ in range(20)]
-    assert max(speeds) < 0.02  # [rad/s]
-
-
-@pytest.mark.slow
-def test_ten_thousand_random_steps_break_no_limit(env: TouchEnv) -> None:
-    random = np.random.default_rng(0)
-    low, high = env.agent.robot.get_qlimits()[0].T
-    worst = 0.0
-    for step in range(10_000):
-        if step % 32 == 0:
-            env.reset()
-        env.step(random.uniform(-1, 1, 26).astype(np.float32))
-        qpos = env.agent.robot.get_qpos()[0]
-        assert qpos.isfinite().all()
-        worst = max(worst, (low - qpos).max().item(), (qpos - high).max().item())
-    assert worst < TWO_DEGREES
+    tips = [link.name for link in env.agent.fingertip_links]
+    assert tips == [finger[-1] for finger in links]
