@@ -1,7 +1,14 @@
-"""InstructRobot on ManiSkill: a NAO learns to touch what a sentence names.
+"""InstructRobot on ManiSkill: a robot learns by reward to do what a sentence says.
 
-Importing this package registers the robot `nao` and every task id, and does
-nothing else.
+Importing this package registers the robots and every task id, and does nothing else.
+
+    make_vec       envs that step together, on CPU or GPU
+    load_policy    a trained policy: `act(obs)`
+    train          learn a task
+    evaluate       play seeded episodes, and count
+    record         film a policy
+    Experiment     what a task is; `register` makes one known to `gym.make`
+    Goal           what a sentence asks for: `Touch`, `Push`, ... or a verb of your own
 """
 
 import os
@@ -13,6 +20,7 @@ if "torch" not in sys.modules:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import ir_maniskill.tasks  # noqa: F401 - registers the tasks
+from ir_maniskill.api import evaluate, record
 from ir_maniskill.environment.vector import make_vec
 from ir_maniskill.experiment import (
     Experiment,
@@ -25,6 +33,7 @@ from ir_maniskill.experiment import (
 from ir_maniskill.goals import Avoid, Both, Goal, Push, Ref, Then, Touch
 from ir_maniskill.policy import Policy, load_policy
 from ir_maniskill.registration import register
+from ir_maniskill.training.train import train
 
 __all__ = [
     "Avoid",
@@ -40,9 +49,12 @@ __all__ = [
     "Touch",
     "TouchObject",
     "available",
+    "evaluate",
     "load_policy",
     "make_vec",
+    "record",
     "register",
     "touch_instructions",
+    "train",
 ]
 __version__ = "0.1.0"

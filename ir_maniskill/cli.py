@@ -15,25 +15,15 @@ from typing import Annotated, Any, Literal
 import tyro
 from tyro.conf import Positional, arg, subcommand
 
-from ir_maniskill import doctor
+from ir_maniskill import api, doctor
 from ir_maniskill import experiment as catalog
-from ir_maniskill.agent.agent import Agent
 from ir_maniskill.environment.robots.robot import Robot, available_robots, short_name
 from ir_maniskill.evaluation import plots, video
-from ir_maniskill.evaluation.evaluate import (
-    EVALUATION_SEED,
-    evaluate_policy,
-    write_report,
-)
+from ir_maniskill.evaluation.evaluate import EVALUATION_SEED, write_report
 from ir_maniskill.experiment import Experiment
-from ir_maniskill.policy import shipped
+from ir_maniskill.files import require_writable
+from ir_maniskill.policy import load_policy, shipped
 from ir_maniskill.training import distributed
-from ir_maniskill.training.checkpoint import (
-    MismatchError,
-    load_policy,
-    require_match,
-    writing,
-)
 from ir_maniskill.training.config import (
     CONFIGS,
     RenderBackend,
@@ -46,7 +36,7 @@ from ir_maniskill.training.run_folder import stored_config
 from ir_maniskill.training.train import for_experiment
 from ir_maniskill.training.train import run as train
 
-TaskId = Positional[Annotated[str, arg(metavar="ID")]]
+TaskId = Positional[Annotated[str, arg(metavar="[MODULE:]ID")]]
 
 
 class UsageError(ValueError):
@@ -63,7 +53,7 @@ class TrainOptions(TrainConfig):
     """A training configuration whose task is given by place."""
 
     env_id: TaskId = ""
-    """Task to learn, e.g. NaoTouchCubeSingle-v1."""
+    """Task to learn, e.g. NaoTouchCubeSingle-v1; MODULE is imported first."""
     out: str = ""
     """Folder of the run; runs/ID if empty."""
 
@@ -84,7 +74,7 @@ class Evaluate:
     """Evaluate a policy: success, exclusive success and touch, per instruction."""
 
     env_id: TaskId
-    """Task, e.g. NaoTouchCubeSingle-v1."""
+    """Task, e.g. NaoTouchCubeSingle-v1; MODULE is imported first."""
     checkpoint: Path | None = None
     """Policy or checkpoint file; None: the one that ships with the package."""
     any_task: bool = False
@@ -110,7 +100,7 @@ class Video:
     """Make a video of a policy (.mp4, or .gif)."""
 
     env_id: TaskId
-    """Task, e.g. NaoTouchCubeSingle-v1."""
+    """Task, e.g. NaoTouchCubeSingle-v1; MODULE is imported first."""
     checkpoint: Path | None = None
     """Policy or checkpoint file; None: the one that ships with the package."""
     any_task: bool = False
@@ -235,7 +225,8 @@ def _config(command: Train) -> TrainConfig:
     """Return the configuration that a train command asks for."""
     options = command.config
     numbers = {f.name: getattr(options, f.name) for f in _TRAIN_FIELDS}
-    numbers["out"] = options.out or f"runs/{catalog.get(options.env_id).id}"
+    numbers["env_id"] = catalog.get(options.env_id).id
+    numbers["out"] = options.out or f"runs/{numbers['env_id']}"
     return TrainConfig(**numbers)
 
 
@@ -300,61 +291,50 @@ def _evaluate(command: Evaluate) -> int:
     _require("num-envs", command.num_envs, least=1)
     _require("episodes", command.episodes, least=1)
     _require("seed", command.seed, least=0)
-    chosen = _find_instruction(task, command.instruction)
-    path = _find_policy(task, command.checkpoint)
-    agent, config, facts = _load(path, task, command.any_task)
-    agent.to(distributed.device())
+    policy = load_policy(_find_policy(task, command.checkpoint))
     if command.json is not None:
-        _require_writable(command.json)
-    kwargs = config.env_kwargs(training=False)
-    kwargs["sim_backend"] = command.sim_backend
-    kwargs["render_backend"] = command.render_backend
-    report = evaluate_policy(
-        agent.policy,
+        require_writable(command.json)
+    report = api.evaluate(
+        policy,
         task.id,
         episodes=command.episodes,
         seed=command.seed,
         num_envs=command.num_envs,
-        frames=config.frames,
-        env_kwargs=kwargs,
-        instructions=chosen,
-        progress=True,
+        instruction=command.instruction,
+        any_task=command.any_task,
+        sim_backend=command.sim_backend,
+        render_backend=command.render_backend,
     )
     print(report)
     if command.json is not None:
         write_report(
             command.json,
             report,
-            reward_mode=kwargs["reward_mode"],
-            checkpoint=str(path),
-            trained_steps=facts.get("steps"),
-            config=dataclasses.asdict(config),
+            reward_mode=policy.env_kwargs["reward_mode"],
+            checkpoint=str(command.checkpoint or task.id),
+            trained_steps=policy.metadata.get("steps"),
+            config=dataclasses.asdict(policy.config),
         )
     return 0
 
 
 def _video(command: Video) -> int:
     task = catalog.get(command.env_id)
-    _require("episodes", command.episodes, least=1)
     _require("seed", command.seed, least=0)
-    if not 0.05 <= command.speed <= 4:
-        raise UsageError(f"--speed: got {command.speed:g}, expected 0.05 to 4")
-    chosen = _find_instruction(task, command.instruction)
     path = _find_policy(task, command.checkpoint)
-    agent, config, _ = _load(path, task, command.any_task)
     out = command.out or Path("runs") / f"{task.id}.mp4"
     video.check_name(out)
-    _require_writable(out)
-    snapshots = video.record(
-        agent.policy,
+    require_writable(out)
+    api.record(
+        path,
+        out,
         task.id,
         episodes=command.episodes,
         seed=command.seed,
-        frames=config.frames,
-        env_kwargs=config.env_kwargs(training=False),
-        instructions=chosen,
+        speed=command.speed,
+        instruction=command.instruction,
+        any_task=command.any_task,
     )
-    video.write_video(out, snapshots, speed=command.speed)
     print(f"The video is in {out}.")
     return 0
 
@@ -371,7 +351,7 @@ def _bench(command: Bench) -> int:
     from ir_maniskill import bench  # it loads much that others don't need
 
     if command.json is not None:
-        _require_writable(command.json)
+        require_writable(command.json)
     report = bench.run(command.seconds, command.quick)
     print(report)
     if command.json is not None:
@@ -402,47 +382,12 @@ def _find_policy(task: Experiment, given: Path | None) -> Path:
     return path
 
 
-def _load(
-    path: Path, task: Experiment, any_task: bool
-) -> tuple[Agent, TrainConfig, dict[str, Any]]:
-    """Return what `load_policy` does, of a policy for this task."""
-    agent, config, facts = load_policy(path)
-    try:
-        require_match(config, facts, task, any_task=any_task)
-    except MismatchError as error:
-        hint = "" if any_task else "; name its task, or add --any-task to try it here"
-        raise UsageError(f"{path}: {error}{hint}") from error
-    return agent, config, facts
-
-
-def _find_instruction(task: Experiment, text: str | None) -> tuple[int, ...] | None:
-    """Return the index of a sentence of the task; None: all of them."""
-    if text is None:
-        return None
-    known = [sentence.lower().rstrip(".") for sentence in task.sentences]
-    wanted = text.lower().strip().rstrip(".")
-    if wanted not in known:
-        listed = ", ".join(map(repr, task.sentences))
-        raise UsageError(f"--instruction: got {text!r}, available: {listed}")
-    return (known.index(wanted),)
-
-
 def _require(name: str, value: int, least: int) -> None:
     if value < least:
         raise UsageError(f"--{name}: got {value}, expected at least {least}")
 
 
-def _require_writable(path: Path) -> None:
-    """Raise before the work is done whose result could not be written."""
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        new = not path.exists()
-        path.open("ab").close()
-        if new:
-            path.unlink()
-
-
-_DESCRIPTION = "InstructRobot: a NAO humanoid learns to touch what a sentence names."
+_DESCRIPTION = "InstructRobot: a robot learns to do what a sentence says."
 
 _TRAIN_FIELDS = dataclasses.fields(TrainConfig)
 

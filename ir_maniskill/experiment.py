@@ -6,10 +6,13 @@ An `Experiment` is plain data; a new task is a new `Experiment` handed to
 
 from __future__ import annotations
 
+import importlib
 import itertools
 import logging
 import math
+import os
 import re
+import sys
 import unicodedata
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -353,9 +356,17 @@ def add(experiment: Experiment) -> None:
 def get(experiment_id: str) -> Experiment:
     """Return the experiment of that id.
 
+    Args:
+        experiment_id: The id; with "MODULE:" before it the module, one in the current
+            folder too, is imported first, so that it can register its tasks.
+
     Raises:
+        ExperimentError: The module cannot be imported.
         UnknownExperimentError: There is none; the message lists those there are.
     """
+    module, _, experiment_id = experiment_id.rpartition(":")
+    if module:
+        _import(module)
     try:
         return _CATALOG[experiment_id]
     except KeyError:
@@ -363,6 +374,17 @@ def get(experiment_id: str) -> Experiment:
             f"unknown task id: got {experiment_id!r}, "
             f"available: {', '.join(available())}"
         ) from None
+
+
+def _import(module: str) -> None:
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
+    try:
+        importlib.import_module(module)
+    except ImportError as error:
+        raise ExperimentError(
+            f"task: got module {module!r}, which cannot be imported: {error}"
+        ) from error
 
 
 def available() -> tuple[str, ...]:

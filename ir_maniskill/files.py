@@ -20,16 +20,34 @@ def replacing(path: Path) -> Iterator[Path]:
     """
     aside = path.with_name(f".{os.getpid()}.{path.name}")
     try:
+        with writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            yield aside
+            with aside.open("rb") as file:
+                os.fsync(file.fileno())
+            aside.replace(path)
+    finally:
+        aside.unlink(missing_ok=True)
+
+
+def require_writable(path: Path) -> None:
+    """Raise OSError before the work is done whose result could not be written."""
+    new = not path.exists()
+    with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        yield aside
-        with aside.open("rb") as file:
-            os.fsync(file.fileno())
-        aside.replace(path)
+        path.open("ab").close()
+        if new:
+            path.unlink()
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn whatever keeps `path` from being written into one clear OSError."""
+    try:
+        yield
     except OSError as error:
         reason = error.strerror or error
         raise OSError(
             f"cannot write {path}: {reason}; free some space or choose another folder "
             "(what was there before is intact)"
         ) from error
-    finally:
-        aside.unlink(missing_ok=True)
