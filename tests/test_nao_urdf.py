@@ -196,6 +196,39 @@ def test_missing_meshes_are_named_once_with_where_they_were_sought(
     assert str(urdf) in message and str(urdf.parent) in message
 
 
+@pytest.mark.parametrize(
+    "start",
+    [
+        "file://localhost{folder}/",
+        "file://{folder}/",
+        "model://nao_meshes/meshes/",
+        "{folder}/more%20meshes/../",
+        "package://nao_meshes/more%20meshes/",
+    ],
+)
+def test_meshes_are_found_by_urls(urdf: Path, tmp_path: Path, start: str) -> None:
+    folder = tmp_path / "nao_meshes" / "meshes"
+    (folder / "more meshes").mkdir()
+    (tmp_path / "nao_meshes" / "more meshes").symlink_to(folder)
+    edited(urdf, f"{MESHES}/", start.format(folder=folder))
+    theirs = ET.fromstring(adapt(urdf, str(URDF_PATH)))
+    names = [Path(mesh.attrib["filename"]) for mesh in theirs.iter("mesh")]
+    assert all(name.samefile(folder / name.name) for name in names)
+
+
+@pytest.mark.parametrize("missing", [("texture",), ("mesh", "texture")])
+def test_a_missing_texture_is_called_one(
+    urdf: Path, tmp_path: Path, missing: tuple[str, ...]
+) -> None:
+    paint = '<material name="paint"><texture filename="paint.png"/></material><link '
+    urdf.write_text(urdf.read_text().replace("<link ", paint, 1))
+    if "mesh" in missing:
+        (tmp_path / "nao_meshes" / "meshes" / "phalanx.stl").unlink()
+    with pytest.raises(RobotError, match=r"missing textures: paint\.png;") as error:
+        adapt(urdf, str(URDF_PATH))
+    assert ("missing meshes" in str(error.value)) == ("mesh" in missing)
+
+
 # -- What else may be missing ----------------------------------------------------------
 
 
@@ -213,10 +246,10 @@ def test_missing_meshes_are_named_once_with_where_they_were_sought(
         ('<child link="RForeArm" />', "", "RElbowRoll.*missing <child>"),
         ('rpy="1.8862 0.976662 0.264067"', 'rpy="1 2"', "expected three numbers"),
         ('value="1.04956"', 'value="heavy"', "heavy"),
-        ('value="1.04956"', 'value="nan"', "got nan, expected a finite number"),
+        ('value="1.04956"', 'value="nan"', "torso.*got 'nan', expected a finite"),
         ('rpy="1.8862 0.976662 0.264067"', 'rpy="1 2 inf"', "expected three numbers"),
         ('<link name="torso">', "<link>", "a <link> has no name"),
-        ('upper="2.08567"', 'upper="-3"', "got -2.08567 to -3.0, no range"),
+        ('upper="2.08567"', 'upper="-3"', "'LShoulderPitch'.*upper=\"-3\".*lower < up"),
         ("<robot ", "<sdf", "not XML"),
     ],
 )
@@ -227,6 +260,63 @@ def test_what_is_missing_or_wrong_is_named(
         adapt(edited(urdf, old, new), str(URDF_PATH))
 
 
+def put(path: Path, at: str, **attributes: str) -> Path:
+    """Change attributes of the element that is found there."""
+    tree = ET.parse(path)
+    element = tree.getroot().find(at)
+    assert element is not None
+    element.attrib.update(attributes)
+    tree.write(path)
+    return path
+
+
+ZEROS = dict.fromkeys(MOMENTS, "0")
+COLLISION = "link[@name='LFinger11_link']/collision/geometry"
+VISUAL = "link[@name='RThumb2_link']/visual/geometry"
+
+
+@pytest.mark.parametrize(
+    ("at", "attributes", "named"),
+    [
+        ("joint[@name='HeadPitch']", {"name": "HeadYaw"}, "joint 'HeadYaw': got two"),
+        ("link[@name='Head']", {"name": "Neck"}, "link 'Neck': got two"),
+        ("joint[@name='LElbowYaw']/axis", {"xyz": "0 0 0"}, "'LElbowYaw': <axis>"),
+        ("joint[@name='RThumb1']/axis", {"xyz": "0 0 -0"}, "'RThumb1': <axis>"),
+        ("joint[@name='LElbowYaw']/limit", {"effort": "0"}, "'LElbowYaw'.*effort=.0"),
+        ("joint[@name='RWristYaw']/limit", {"velocity": "-1"}, "'RWristYaw'.*velocity"),
+        ("link[@name='LBicep']/inertial/inertia", ZEROS, "'LBicep': <inertial>.*0 0 0"),
+        ("link[@name='torso']/inertial/inertia", {"iyy": "-1"}, "'torso': <inertial>"),
+        ("link[@name='torso']/inertial/mass", {"value": "-1"}, "'torso': <inertial>"),
+        (f"{COLLISION}/mesh", {"scale": "0.1"}, "'LFinger11_link': <mesh> scale"),
+        (f"{VISUAL}/mesh", {"scale": "a b c"}, "'RThumb2_link': <mesh> scale.*'a b c'"),
+        (f"{COLLISION}/mesh", {"scale": "0.1 -0.1 0.1"}, "'LFinger11_link'.*mirror"),
+        (f"{VISUAL}/mesh", {"scale": "-1 1 1"}, "'RThumb2_link'.*-1 1 1.*mirror"),
+        (f"{VISUAL}/mesh", {"filename": ""}, "'RThumb2_link': <mesh>.*'filename'"),
+    ],
+)
+def test_what_a_simulator_would_choke_on_is_named(
+    urdf: Path, at: str, attributes: dict[str, str], named: str
+) -> None:
+    with pytest.raises(RobotError, match=f"{urdf.name}: .*{named}"):
+        adapt(put(urdf, at, **attributes), str(URDF_PATH))
+
+
+@pytest.mark.parametrize("shape", ["", "<cone radius='1'/>", "<sphere radius='0'/>"])
+def test_a_geometry_without_a_size_is_named(urdf: Path, shape: str) -> None:
+    box = '<link name="l_gripper"><collision><geometry>'
+    box += f"{shape}</geometry></collision>"
+    edited(urdf, '<link name="l_gripper">', box)
+    with pytest.raises(RobotError, match=f"{urdf.name}: link 'l_gripper': <"):
+        adapt(urdf, str(URDF_PATH))
+
+
+@pytest.mark.parametrize("before", ["\n  ", "\ufeff", "\ufeff \n"])
+def test_a_declaration_need_not_come_first(urdf: Path, before: str) -> None:
+    declared = f'{before}<?xml version="1.0" encoding="utf-8"?>{urdf.read_text()}'
+    urdf.write_text(declared, encoding="utf-8")
+    assert adapt(urdf, str(URDF_PATH)).startswith("<robot")
+
+
 def test_fingers_that_cannot_touch_are_named(urdf: Path) -> None:
     robot = ET.parse(urdf)
     for name in ("LFinger11_link", "RThumb2_link"):
@@ -235,6 +325,24 @@ def test_fingers_that_cannot_touch_are_named(urdf: Path) -> None:
     robot.write(urdf)
     with pytest.raises(RobotError, match="LFinger11_link, RThumb2_link; touch"):
         adapt(urdf, str(URDF_PATH))
+
+
+@pytest.mark.parametrize("finger", ["LFinger13", "RThumb2"])
+def test_a_finger_whose_mesh_is_a_text_is_named(urdf: Path, finger: str) -> None:
+    (urdf.parents[2] / "nao_meshes" / "meshes" / "text.stl").write_text("a pointer")
+    at = f"link[@name='{finger}_link']/collision/geometry/mesh"
+
+    class Numb(Nao):
+        uid = "numb"
+        urdf_path = str(put(urdf, at, filename=f"{MESHES}/text.stl"))
+
+    with pytest.raises(RobotError, match=f"{urdf.name}: .*cannot be made: {finger}_l"):
+        gym.make(
+            "NaoTouchCubeSingle-v1",
+            robot_uids=Numb,
+            obs_mode="state",
+            render_backend="none",
+        )
 
 
 def test_a_missing_file_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,13 +17,13 @@ from ir_maniskill import Experiment, TouchObject
 from ir_maniskill import experiment as catalog
 from ir_maniskill.environment import table_scene
 from ir_maniskill.environment.robots import Nao, Panda, UnitreeG1
-from ir_maniskill.environment.robots.description import read_motors
 from ir_maniskill.environment.robots.robot import (
     JointGroup,
     Robot,
     RobotError,
     find_robot,
 )
+from ir_maniskill.environment.robots.urdf import read_motors
 from ir_maniskill.environment.state import CAMERAS
 from ir_maniskill.environment.touch_env import TouchEnv
 from ir_maniskill.evaluation.video import VIEW, VIEWPOINT
@@ -214,6 +214,7 @@ def edge(camera: CameraConfig, points: np.ndarray) -> float:
 # -- A robot of one's own --------------------------------------------------------------
 
 BOX = "<collision><geometry><box size='0.02 0.02 0.1'/></geometry></collision>"
+MIRRORED = BOX.replace("box size='0.02 0.02 0.1'", "mesh filename='x' scale='1 -1 1'")
 INERTIAL = (
     "<inertial><mass value='0.1'/><inertia ixx='1e-3' iyy='1e-3' izz='1e-3' ixy='0' "
     "ixz='0' iyz='0'/></inertial>"
@@ -306,6 +307,11 @@ def test_a_joint_that_is_not_driven_is_held_and_one_that_mimics_is_free(
             "'bend_1'.*effort=\"x\"",
         ),
         (joint("bend", "arm", "tip"), "missing joints: bend_1.*lift, bend"),
+        (link("arm"), "link 'arm': got two"),
+        (joint("lift", "arm", "tip"), "joint 'lift': got two"),
+        (link("flag", BOX.replace("0.02 0.02 0.1", "0")), "link 'flag': <box> size"),
+        (link("flag", MIRRORED), "link 'flag': <mesh> scale.*mirror"),
+        (joint("spin", "arm", "tip").replace("0 1 0", "0 0 0"), "'spin': <axis>"),
         ("<link>", "not XML"),
     ],
 )

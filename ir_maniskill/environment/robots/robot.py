@@ -25,11 +25,8 @@ from torch import Tensor
 from ir_maniskill.environment import contacts
 from ir_maniskill.environment.bodies import positions
 from ir_maniskill.environment.robots.controller import TargetControllerConfig
-from ir_maniskill.environment.robots.description import (
-    RobotError,
-    read_builder,
-    read_motors,
-)
+from ir_maniskill.environment.robots.loader import read_builder
+from ir_maniskill.environment.robots.urdf import RobotError, read_motors
 from ir_maniskill.experiment import Experiment, ExperimentError
 
 
