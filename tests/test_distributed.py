@@ -230,6 +230,7 @@ def trained(tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_ranks_end_with_the_same_weights_and_explore_apart(trained):
     first, second = load(trained)
     assert first["weights"].keys() == second["weights"].keys()
@@ -238,11 +239,13 @@ def test_ranks_end_with_the_same_weights_and_explore_apart(trained):
     assert not torch.isclose(first["action"], second["action"]).any()
 
 
+@pytest.mark.slow
 def test_the_ranks_have_the_scenes_of_one_with_all_envs(trained, tmp_path):
     scene = runner_of(*toy(tmp_path)).state["proprioception"]
     assert torch.equal(torch.cat([got["scene"] for got in load(trained)]), scene)
 
 
+@pytest.mark.slow
 def test_a_run_of_two_ranks_resumes_bit_for_bit(trained):
     whole, halves = (
         checkpoint.read(trained / name / "last.safetensors").tensors
@@ -253,6 +256,7 @@ def test_a_run_of_two_ranks_resumes_bit_for_bit(trained):
     assert metrics(trained / "whole") == metrics(trained / "halves")
 
 
+@pytest.mark.slow
 def test_one_set_of_records_counts_all_ranks(trained):
     steps = [int(row["steps"]) for row in metrics(trained / "whole")]
     assert steps == [UPDATE * i for i in (1, 2, 3, 4)]
@@ -277,6 +281,7 @@ def lose_the_other(out):
             train(config, envs)
 
 
+@pytest.mark.slow
 def test_a_rank_that_fails_stops_the_others_with_their_work_saved(tmp_path):
     assert in_ranks(lose_the_other, tmp_path) == [0, 1]
     stored = checkpoint.read(tmp_path / "last.safetensors")

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import json
 import math
+import re
 import shutil
 
 import pytest
@@ -407,6 +408,13 @@ def test_noise_and_penalties_follow_the_share_of_the_steps(tmp_path):
     noise = [float(row["std"]) for row in got]
     assert noise == pytest.approx([0.5, 0.4, 0.3, 0.2], abs=1e-4)
     assert [float(row["penalty"]) for row in got] == [0, 0.5, 1, 1]
+
+
+def test_the_progress_tells_why_a_return_falls(tmp_path, capsys):
+    run(toy_config(tmp_path, penalty_warmup=0.5, eval_interval=2 * UPDATE))
+    shown = capsys.readouterr().err.replace("\r", "\n")
+    assert re.search(r"return .*, success .*, penalties 100%, noise 0.16 \|", shown)
+    assert re.search(r"\| policy at 1024: success .*, exclusive .*fingers", shown)
 
 
 def test_what_final_infos_say_of_episodes_that_go_on_does_not_count():

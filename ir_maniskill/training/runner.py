@@ -93,12 +93,13 @@ class Runner:
         )
         self.newest = self.snapshot()
         self._write()  # shows at once that we can
-        silent = distributed.rank() > 0
+        silent, figures = distributed.rank() > 0, Figures()
         bar = tqdm(total=total, initial=self.steps, unit=" steps", disable=silent)
         with bar, self._kept_at_last():
             while True:
                 if self._evaluation_is_due():
                     self.evaluate()
+                    bar.set_postfix_str(_summary(figures) + self.said)
                 if self._due(self.config.checkpoint_interval, self.saved):
                     self.save()
                 if self.steps >= total:
@@ -361,12 +362,11 @@ def figures_of(report: EvaluationReport) -> Figures:
 
 def _summary(figures: Figures) -> str:
     """Return what the progress bar says of the last update."""
-    reward, success = figures["train/return"], figures["train/success"]
-    told = [f"return {reward:.2f}", f"success {success:.0%}"]
-    if "penalty" in figures:
-        told.append(f"penalties {figures['penalty']:.0%}")
-    if "std" in figures:
-        told.append(f"noise {figures['std']:.2f}")
+    names = {"train/return": "return {:.2f}", "train/success": "success {:.0%}"}
+    names |= {"penalty": "penalties {:.0%}", "std": "noise {:.2f}"}
+    told = (
+        form.format(figures[name]) for name, form in names.items() if name in figures
+    )
     return ", ".join(told)
 
 
