@@ -171,6 +171,8 @@ class Robot(BaseAgent, ABC):
         self.fingertip_links = tuple(links[self._tip_of(f)] for f in self.fingers)
         controller = self.controller
         self._order = controller.active_joint_indices  # [J] action order -> qpos
+        # ManiSkill's `get_qlimits` goes through all envs, so it is asked only once.
+        self._limits = [self.to_qpos(x) for x in (controller.lower, controller.upper)]
         self._middle = (controller.lower + controller.upper) / 2  # [J] [rad]
         self._half_range = (controller.upper - controller.lower) / 2  # [J] [rad]
         slides = torch.tensor([self._motors[name].slides for name in self.joints])
@@ -262,8 +264,7 @@ class Robot(BaseAgent, ABC):
 
     def clamp_qpos(self, qpos: Tensor) -> Tensor:
         """Keep joint positions in the simulator's order within the limits [..., J]."""
-        limits = self.robot.get_qlimits()[0]  # [J, 2]
-        return qpos.clamp(limits[:, 0], limits[:, 1])
+        return qpos.clamp(*self._limits)
 
     # -- Senses ----------------------------------------------------------------------
 
