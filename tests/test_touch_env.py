@@ -27,10 +27,18 @@ from ir_maniskill.experiment import Jitter
 from ir_maniskill.goals import Ref, Touch
 
 IDS = ir_maniskill.available()[:8]
+QUICK = ("NaoTouchButtonMulti-v1", "NaoTouchCubeShuffled-v1")
+"""Tasks that stand for all where time is short."""
 DELTA = "pd_joint_target_delta_pos"
 
 
-@pytest.fixture(scope="module", params=IDS)
+@pytest.fixture(
+    scope="module",
+    params=[
+        *QUICK,
+        *(pytest.param(i, marks=pytest.mark.slow) for i in IDS if i not in QUICK),
+    ],
+)
 def env(request: pytest.FixtureRequest, multi_env: gym.Env) -> Iterator[gym.Env]:
     """Each task in turn, with small pictures and the simulator's state.
 
@@ -162,6 +170,7 @@ def test_state_survives_the_round_trip(env: gym.Env) -> None:
 # -- Modes ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_defaults_are_the_papers() -> None:
     env = gym.make("ir_maniskill:NaoTouchCubeSingle-v1", obs_mode="rgb")
     obs, _ = env.reset(seed=0)
@@ -410,6 +419,7 @@ def test_the_named_object_costs_by_its_own_speed() -> None:
 # -- At home in its ecosystem ---------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_record_episode_writes_a_playable_video(tmp_path: Path) -> None:
     env = gym.make(
         "NaoTouchCubeMulti-v1",
@@ -429,6 +439,7 @@ def test_record_episode_writes_a_playable_video(tmp_path: Path) -> None:
     assert list(tmp_path.glob("*.h5"))
 
 
+@pytest.mark.slow
 def test_gymnasiums_checker_accepts_the_cpu_wrapper() -> None:
     env = gym.make("NaoTouchButtonSingle-v1", obs_mode="state", render_backend="none")
     # Left out: what makes the env anew from its spec, since ManiSkill's time limit
@@ -437,6 +448,7 @@ def test_gymnasiums_checker_accepts_the_cpu_wrapper() -> None:
     env.close()
 
 
+@pytest.mark.slow
 def test_without_vulkan_there_is_one_clear_error_and_state_modes_work() -> None:
     script = """
         import gymnasium as gym, ir_maniskill
