@@ -53,7 +53,8 @@ def evaluate(
         MismatchError: It was trained for another task, robot or vocabulary.
         ValueError: There is no such sentence, or too few episodes.
     """
-    policy, experiment = _matched(policy, task, any_task)
+    robot = env_kwargs.get("robot_uids")
+    policy, experiment = _matched(policy, task, any_task, robot)
     return evaluate_policy(
         policy.agent.policy,
         experiment.id,
@@ -118,14 +119,14 @@ def record(
 
 
 def _matched(
-    policy: PolicyLike, task: str | None, any_task: bool
+    policy: PolicyLike, task: str | None, any_task: bool, robot: str | None = None
 ) -> tuple[Policy, Experiment]:
     """Return the policy, and the task that it shall play."""
     if not isinstance(policy, Policy):
         policy = load_policy(policy)
     experiment = catalog.get(task or policy.env_id)
     try:
-        policy.require_match(experiment, any_task=any_task)
+        policy.require_match(experiment, robot, any_task=any_task)
     except MismatchError as error:
         hint = "" if any_task else "; name its task, or use any_task to try it here"
         raise MismatchError(f"{error}{hint}") from error

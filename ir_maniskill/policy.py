@@ -103,18 +103,25 @@ class Policy:
         tokens = tokens_of(sentences, self.vocabulary)
         return {"instruction": tokens, "text": text_of(sentences)}
 
-    def require_match(self, experiment: Experiment, *, any_task: bool = False) -> None:
-        """Raise unless it was trained for this task, as it is now.
+    def require_match(
+        self,
+        experiment: Experiment,
+        robot: str | None = None,
+        *,
+        any_task: bool = False,
+    ) -> None:
+        """Raise unless it was trained for this task, as it is now, and this robot.
 
         Args:
             experiment: The task.
+            robot: What `robot_uids` takes; None: its own.
             any_task: Accept another task, if it has the same words.
 
         Raises:
             MismatchError: Naming all that is different.
         """
         checkpoint.require_match(
-            self.config, self.metadata, experiment, any_task=any_task
+            self.config, self.metadata, experiment, robot, any_task=any_task
         )
 
     def _see(self, obs: Observation) -> State:

@@ -5,9 +5,10 @@ import torch
 
 from ir_maniskill.agent import Agent, StateSpec, language_system
 from ir_maniskill.agent.actor import Actor
+from ir_maniskill.agent.agent import asks
 from ir_maniskill.agent.alignment import FiLM
 from ir_maniskill.agent.critic import Standardize
-from ir_maniskill.agent.language_system import LanguageEncoder
+from ir_maniskill.agent.language_system import LanguageEncoder, TokenTransformer
 from ir_maniskill.agent.perceptual_system import PaperVision, PatchVision, pixels
 from ir_maniskill.checks import ConfigError
 from ir_maniskill.environment.senses import read_text, text_of
@@ -41,11 +42,12 @@ def make_agent(state, **changes):
 
 def language(**changes):
     torch.manual_seed(0)
-    return language_system.make(AgentConfig(**changes))
+    config = AgentConfig(**changes)
+    return language_system.encoder_of(config)(config)
 
 
 def test_language_of_the_paper_has_five_times_fifty_outputs():
-    system = language_system.make(CONFIGS["paper"].agent)
+    system = TokenTransformer(CONFIGS["paper"].agent)
     assert system.width == 250
     assert system(torch.tensor([[3, 4, 5, 8, 2]])).shape == (1, 250)
 
@@ -105,6 +107,7 @@ def test_an_encoder_of_ones_own_may_read_the_text(monkeypatch):
     language_system.register("letters", BagOfLetters)
     state = make_state() | {"text": text_of(["Aa b.", "b", "", "Touch the blue cube."])}
     agent = make_agent(state, language="letters")
+    assert asks(agent.config) == ("text",) and asks(AgentConfig()) == ()
     assert agent.encoder.language(state["text"])[0, :3].tolist() == [2, 1, 0]
     assert agent.encoder.width == 26 + 256 + 128
     before = agent.policy(state)

@@ -105,3 +105,15 @@ def test_any_uniform_number_picks_an_instruction(numbers: list[float]) -> None:
     ordered = instructions.pick(torch.tensor(sorted(numbers)))
     assert ((ordered >= 0) & (ordered < len(instructions))).all()
     assert (ordered.diff() >= 0).all()
+
+
+def test_a_word_that_is_not_in_the_vocabulary_is_warned_of_once(caplog) -> None:
+    blue = TouchObject("blue", (0.20, 0.0))
+    said = Instruction("Kindly touch the blue cube.", Touch(Ref("blue")))
+    for _ in range(3):
+        Experiment("Kind-v1", (blue,), (said,), vocabulary=VOCABULARY)
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    assert "'Kindly touch the blue cube.'" in caplog.text
+    assert caplog.text.strip().endswith("not in the vocabulary: kindly")
+    Experiment("Kind-v1", (blue,), (said,))  # its words are those of the sentence
+    assert len(caplog.records) == 1

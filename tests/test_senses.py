@@ -126,13 +126,18 @@ def test_text_comes_back_from_its_bytes() -> None:
 # -- What envs observe -----------------------------------------------------------------
 
 
-@pytest.mark.render
-def test_the_env_observes_the_list_in_order(multi_env) -> None:
-    obs, _ = multi_env.reset(seed=0, options={"instruction": 1})
-    assert [*obs["agent"]] == ["proprioception", "target"]
-    assert [*obs["extra"]] == ["touch", "instruction", "text"]
-    text = multi_env.unwrapped.get_language_instruction()
-    assert senses.read_text(obs["extra"]["text"]) == text == ["Touch the red cube."]
+def test_text_is_observed_where_it_is_asked_for() -> None:
+    kwargs = {"obs_mode": "state_dict", "render_backend": "none"}
+    env = gym.make("NaoTouchCubeMulti-v1", observe=("text",), **kwargs)
+    obs, _ = env.reset(seed=0, options={"instruction": 1})
+    env.close()
+    assert [*obs["agent"]] == ["proprioception", "target", "velocity"]
+    assert [*obs["extra"]][:4] == ["touch", "instruction", "text", "object_position"]
+    assert senses.read_text(flatten(obs)["text"]) == ["Touch the red cube."]
+    with pytest.raises(
+        ValueError, match="observe: got .*'smell'.* available: .*'text'"
+    ):
+        gym.make("NaoTouchCubeMulti-v1", observe=("smell",), **kwargs)
 
 
 def clock(env: TouchEnv, _: dict) -> torch.Tensor:

@@ -16,7 +16,7 @@ from ir_maniskill.agent.config import AgentConfig
 from ir_maniskill.agent.critic import Critic, Standardize
 from ir_maniskill.agent.perceptual_system import BodySense, PaperVision, PatchVision
 from ir_maniskill.checks import require
-from ir_maniskill.environment.senses import State
+from ir_maniskill.environment.senses import State, askable
 from ir_maniskill.environment.senses import entries as entries_of
 
 
@@ -51,6 +51,15 @@ class StateSpec:
                     f"{expected}; make the environment with the robot, camera size, "
                     "obs_mode and frames of the agent's config"
                 )
+
+
+def asks(config: AgentConfig) -> tuple[str, ...]:
+    """Return what an env must be asked to observe for this agent: its `observe`."""
+    reads = (
+        *language_system.encoder_of(config).reads,
+        *entries_of(config.senses or ()),
+    )
+    return tuple(name for name in reads if name in askable())
 
 
 class Act(NamedTuple):
@@ -90,7 +99,7 @@ class StateEncoder(nn.Module):
             )
         self.sensed = tuple(entries)
         """Entries of the state that it needs, beside the sentence."""
-        self.language = language_system.make(config)
+        self.language = language_system.encoder_of(config)(config)
         self.width = self.language.width
         """Size of B_t."""
         self.vision: nn.Module | None = None

@@ -48,15 +48,15 @@ def register(name: str, encoder: type[LanguageEncoder]) -> None:
     require(free, "name of a language encoder", name, "one that is not taken")
 
 
-def make(config: AgentConfig) -> LanguageEncoder:
-    """Return the untrained encoder that the config names.
+def encoder_of(config: AgentConfig) -> type[LanguageEncoder]:
+    """Return the encoder that the config names.
 
     Raises:
         ConfigError: There is none of that name.
     """
     name, known = config.language, ", ".join(map(repr, _ENCODERS))
     require(name in _ENCODERS, "language", name, f"one of {known}")
-    return _ENCODERS[name](config)
+    return _ENCODERS[name]
 
 
 class EncoderLayer(nn.Module):

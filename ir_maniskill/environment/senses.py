@@ -55,8 +55,8 @@ class Term:
     """Whether the state has its last S values [N, S, shape], the newest first."""
     part: Part = "extra"
     """Where the observation has it; of "agent" the info is not known yet."""
-    flat: bool = True
-    """Whether flat observations (obs_mode "state") have it, too."""
+    asked: bool = False
+    """Whether only envs have it that are asked to: `gym.make(ID, observe=(name,))`."""
     read: Callable[[Observation], Tensor | None] | None = None
     """Finds it in an observation, if it is not simply there."""
 
@@ -120,7 +120,7 @@ _TERMS = [
     Term("target", "body", "J", stacked=True, part="agent"),
     Term("touch", "body", "F", _touched, stacked=True),
     Term("instruction", "language", "L", _of_sentence("tokens")),
-    Term("text", "language", "B", _of_sentence("text"), flat=False),
+    Term("text", "language", "B", _of_sentence("text"), asked=True),
     _privileged("velocity", "J", lambda env, _: env.agent.joint_velocity(), "agent"),
     _privileged("object_position", "C, 3", lambda env, _: positions(env.objects)),
     _privileged("finger_position", "F, 3", lambda env, _: env.agent.finger_position()),
@@ -158,6 +158,22 @@ def register(term: Term) -> Term:
     return term
 
 
+def askable() -> tuple[str, ...]:
+    """Return the names of the terms that only envs have which are asked to."""
+    return tuple(term.name for term in _TERMS if term.asked)
+
+
+def require_askable(names: Iterable[str]) -> tuple[str, ...]:
+    """Return the names of terms that an env is asked to observe.
+
+    Raises:
+        ValueError: There is no such term to ask for.
+    """
+    if isinstance(names, str) or not set(names) <= set(askable()):
+        raise ValueError(f"observe: got {names!r}, available: {askable()}")
+    return tuple(names)
+
+
 def registered() -> tuple[Term, ...]:
     """Return the senses that were registered, for a worker process to do so too."""
     return tuple(_TERMS[_OURS:])
@@ -172,7 +188,7 @@ def observe(env: Any, part: Part, info: Info) -> dict[str, Tensor]:
         if term.part == part
         and term.measure is not None
         and (mode.use_state or term.encoder != "privileged")
-        and (term.flat or not mode.state)
+        and (not term.asked or term.name in env.asked)
     }
 
 

@@ -5,6 +5,7 @@ Legend: N envs, b envs being reset, J joints, F fingers, C objects, L tokens.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -65,6 +66,7 @@ class TouchEnv(RenderedEnv):
         robot_uids: str | type[Robot] = Nao.uid,
         render_backend: str | None = "auto",
         reward_weights: dict[str, float] | None = None,
+        observe: Sequence[str] = (),
         **kwargs: Any,
     ) -> None:
         """Build the env.
@@ -76,6 +78,7 @@ class TouchEnv(RenderedEnv):
             render_backend: As for `BaseEnv`; "auto" is a CUDA device where there is
                 one and else whatever Vulkan finds, software included.
             reward_weights: Changes of `RewardWeights`, for the dense reward modes.
+            observe: What to observe beside the usual: "text" is the sentence's bytes.
             *args: As for `BaseEnv`.
             **kwargs: As for `BaseEnv`.
 
@@ -84,7 +87,8 @@ class TouchEnv(RenderedEnv):
             ExperimentError: It is no experiment, or its goals or places don't fit
                 the robot.
             RobotError: The robot cannot be used.
-            ValueError: Several envs are asked for, but physics is on the CPU.
+            ValueError: Several envs are asked for, but physics is on the CPU; or there
+                is nothing of that name to observe.
             RuntimeError: No Vulkan device can render here; says what to install.
         """
         if isinstance(experiment, str):
@@ -100,6 +104,7 @@ class TouchEnv(RenderedEnv):
         # ManiSkill warns of robots that are not in here; ours are not the only ones.
         self.SUPPORTED_ROBOTS = (*available_robots(), robot_uids)
         self._reward_weights = replace(RewardWeights(), **(reward_weights or {}))
+        self.asked = senses.require_askable(observe)
         self._stepped = False  # whether a step was made that is not judged yet
         if render_backend == "auto":
             render_backend = "gpu" if torch.cuda.is_available() else "cpu"

@@ -25,6 +25,7 @@ from torch import Tensor
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.agent.agent import Agent, StateSpec
+from ir_maniskill.environment.robots.robot import short_name
 from ir_maniskill.experiment import Experiment
 from ir_maniskill.files import replacing
 from ir_maniskill.training.config import TrainConfig, from_data, to_data
@@ -336,7 +337,7 @@ def require_match(
         config: How it was trained, and
         metadata: what its file says, both of `load_policy`.
         experiment: The task.
-        robot: Uid of the robot; None: not told, or the policy's own.
+        robot: What `robot_uids` takes; None: not told, or the policy's own.
         any_task: Accept another task, if it has the same words.
 
     Raises:
@@ -346,7 +347,7 @@ def require_match(
     pairs: dict[str, tuple[Any, Any]] = {}
     if words != experiment.vocabulary:
         pairs["vocabulary"] = words, experiment.vocabulary
-    if robot not in (None, config.robot):
+    if robot is not None and short_name(robot) != short_name(config.robot):
         pairs["robot"] = config.robot, robot
     if not any_task:
         if config.env_id != experiment.id:

@@ -14,6 +14,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
+from ir_maniskill.agent.agent import asks
 from ir_maniskill.agent.config import AgentConfig, from_version_1
 from ir_maniskill.checks import ConfigError, require, require_choice
 from ir_maniskill.environment.reward_generator import RewardWeights
@@ -199,6 +200,8 @@ class TrainConfig:
             "reward_mode": "sparse",
             "sensor_configs": cameras,
         }
+        if asks(self.agent):
+            kwargs["observe"] = asks(self.agent)
         if training:
             kwargs["reward_mode"] = self.reward_mode
             kwargs["reward_weights"] = dataclasses.asdict(self.reward_weights)
