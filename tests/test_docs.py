@@ -1,21 +1,73 @@
-"""The tutorial's code runs, the API reference has all, the citation is up to date."""
+"""The pages' code and commands work, links lead somewhere, all public is documented."""
 
 import doctest
 import os
 import re
 import runpy
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import pdoc
 import pytest
-from test_examples import TINY
+from test_examples import TINY, run
 from test_nao_urdf import official
 
 import ir_maniskill
+from ir_maniskill import cli
 
 ROOT = Path(__file__).parents[1]
+README = ROOT / "README.md"
+PAGES = [README, *sorted(ROOT.glob("docs/*.md"))]
+
+# -- All pages -------------------------------------------------------------------------
+
+COMMAND = re.compile(r"^(?: {4}|.*--no-python |.*bin/|)ir-maniskill (.+)$", re.M)
+"""A line of code that calls the program: what it is told."""
+
+
+def headings(page: Path) -> set[str]:
+    """Return the anchors of a page's headings, as GitHub names them."""
+    titles = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", t.lower()).replace(" ", "-") for t in titles}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_links_lead_somewhere(page: Path) -> None:
+    links = re.findall(r"\]\((?!http)([^)]+)\)", page.read_text())
+    for file, _, anchor in (link.partition("#") for link in links):
+        target = page.parent / file if file else page
+        assert target.exists(), file
+        assert not anchor or anchor in headings(target), anchor
+
+
+def test_the_commands_of_the_pages_are_understood() -> None:
+    text = "\n".join(page.read_text() for page in PAGES).replace("\\\n", "")
+    commands = COMMAND.findall(text)
+    assert len(commands) > 10
+    for command in commands:
+        try:
+            cli.parse(shlex.split(command, comments=True))
+        except SystemExit:
+            pytest.fail(f"got ir-maniskill {command}, expected what it understands")
+
+
+@pytest.mark.render
+@pytest.mark.slow
+def test_the_code_of_short_pages_runs(tmp_path: Path) -> None:
+    pages = README.read_text() + (ROOT / "docs" / "other_tools.md").read_text()
+    play, task, left_hand = re.findall(r"^```python\n(.*?)^```", pages, re.M | re.S)
+    assert run(tmp_path, "-c", play).endswith("tensor([True])\n")
+    run(tmp_path, "-c", left_hand)
+    (tmp_path / "fruit.py").write_text(task)
+    make = "import gymnasium as gym; gym.make('fruit:Fruit-v1', obs_mode='state')"
+    run(tmp_path, "-c", make)
+
+
+def test_the_readme_is_short() -> None:
+    assert len(README.read_bytes()) <= 9000
+
 
 # -- The tutorial ----------------------------------------------------------------------
 

@@ -1,9 +1,8 @@
-"""Every example, and what the README shows, runs as a user would run it."""
+"""Every example runs as a user would run it."""
 
 import os
 import re
 import runpy
-import shlex
 import subprocess
 import sys
 from dataclasses import replace
@@ -12,7 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from ir_maniskill import available, cli
+from ir_maniskill import available
 from ir_maniskill.training.config import CONFIGS
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -139,49 +138,3 @@ def test_training_then_evaluating_its_policy(tmp_path: Path) -> None:
     assert re.search(r"Touch the blue cube\. +1 ", out)
     for name in ("report.json", "video.mp4"):
         assert (tmp_path / "runs" / "evaluation" / name).stat().st_size > 1000
-
-
-# -- The README ------------------------------------------------------------------------
-
-ROOT = EXAMPLES.parent
-README = (ROOT / "README.md").read_text()
-
-
-PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
-
-
-def headings(page: Path) -> set[str]:
-    """Return the anchors of a page's headings, as GitHub names them."""
-    titles = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
-    return {re.sub(r"[^\w -]", "", t.lower()).replace(" ", "-") for t in titles}
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_links_lead_somewhere(page: Path) -> None:
-    links = re.findall(r"\]\((?!http)([^)]+)\)", page.read_text())
-    for file, _, anchor in (link.partition("#") for link in links):
-        target = page.parent / file if file else page
-        assert target.exists(), file
-        assert not anchor or anchor in headings(target), anchor
-
-
-@pytest.mark.render
-@pytest.mark.slow
-def test_readme_quick_start_runs(tmp_path: Path) -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-    assert re.search(r"^tensor\(\[(True|False)", run(tmp_path, "-c", code), re.M)
-
-
-COMMAND = re.compile(r"^(?: {4}|.*--no-python |)ir-maniskill (.+)$", re.MULTILINE)
-"""A line of code that calls the program: what it is told."""
-
-
-def test_the_commands_of_the_pages_are_understood() -> None:
-    text = "\n".join(page.read_text() for page in PAGES).replace("\\\n", "")
-    commands = COMMAND.findall(text)
-    assert len(commands) > 10
-    for command in commands:
-        try:
-            cli.parse(shlex.split(command, comments=True))
-        except SystemExit:
-            pytest.fail(f"got ir-maniskill {command}, expected what it understands")
