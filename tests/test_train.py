@@ -432,12 +432,18 @@ def test_what_final_infos_say_of_episodes_that_go_on_does_not_count():
     assert merged["reward_terms"].tolist() == [[1], [1]]
     stale["success"][1] = stale["success_once"][1] = False
     counts.add(torch.zeros(2), done, info_of_step(stale, done))
-    assert (counts.holding, counts.success, counts.episodes) == (1, 1, 1)
+    means = counts.means()
+    assert (means["holding"], means["success"], means["return"]) == (0.5, 1, 0)
 
 
 def test_where_no_episode_ended_there_are_no_figures_of_episodes():
-    means = runner.StepCounts(steps=4, reward=2.0, holding=1).means()
-    assert (means["reward"], means["holding"]) == (0.5, 0.25)
+    going = torch.zeros(4, dtype=torch.bool)
+    names = ("success", "wrong_fingers", "success_once", "exclusive_success")
+    info = dict.fromkeys(names, torch.tensor([1, 0, 0, 0]))
+    counts = runner.StepCounts()
+    counts.add(torch.full((4,), 0.5), going, info)
+    means = counts.means()
+    assert (means["reward"], means["holding"], means["wrong"]) == (0.5, 0.25, 0.25)
     assert all(math.isnan(means[name]) for name in ("return", "success", "exclusive"))
 
 

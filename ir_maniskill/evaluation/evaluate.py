@@ -369,7 +369,8 @@ def _opened(
         if envs is None:
             envs = make_vec(env_id, num_envs, **(kwargs or {}))
             stack.enter_context(contextlib.closing(envs))
-        stack.enter_context(one_thread())
+        # One row of a policy is too little to share: the cores are the simulator's.
+        stack.enter_context(threads(1))
         yield envs
 
 
@@ -433,10 +434,10 @@ def _play(
 
 
 @contextlib.contextmanager
-def one_thread() -> Iterator[None]:
-    """Leave the cores to the simulator: one row of a policy is too little to share."""
+def threads(count: int) -> Iterator[None]:
+    """Let torch compute with that many threads."""
     before = torch.get_num_threads()
-    torch.set_num_threads(1)
+    torch.set_num_threads(count)
     try:
         yield
     finally:

@@ -29,7 +29,7 @@ from ir_maniskill.environment.robots.robot import Robot
 from ir_maniskill.environment.senses import StateStack, cameras
 from ir_maniskill.environment.table_scene import view
 from ir_maniskill.environment.touch_env import CONTROL_FREQ
-from ir_maniskill.evaluation.evaluate import Policy, choose_instructions, one_thread
+from ir_maniskill.evaluation.evaluate import Policy, choose_instructions, threads
 from ir_maniskill.files import replacing
 
 Box = tuple[int, int, int, int]
@@ -185,7 +185,7 @@ def _play(
             history=history,
         )
         if step < total:
-            with one_thread():
+            with threads(1):
                 action = policy(state)
             obs, reward, _, _, info = env.step(action)
             state, score = stack.push(obs), score + float(reward)

@@ -10,7 +10,6 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from tqdm import tqdm
 from ir_maniskill.agent.agent import Agent
 from ir_maniskill.environment.senses import State, StateStack
 from ir_maniskill.environment.vector import VectorEnv, info_of_step
-from ir_maniskill.evaluation.evaluate import EvaluationReport, evaluate_policy
+from ir_maniskill.evaluation.evaluate import EvaluationReport, evaluate_policy, threads
 from ir_maniskill.training import checkpoint, distributed
 from ir_maniskill.training.algorithm import Algorithm, Outcome
 from ir_maniskill.training.checkpoint import CheckpointError, Stored
@@ -123,8 +122,8 @@ class Runner:
                 figures = self.algorithm.update()
             seconds["collect"] += stepped - started
             seconds["update"] += time.perf_counter() - stepped
-        counts, self.counts = self.counts.over_ranks(), StepCounts()
-        figures = {f"train/{k}": v for k, v in counts.means().items()} | figures
+        means, self.counts = self.counts.means(), StepCounts()
+        figures = {f"train/{k}": v for k, v in means.items()} | figures
         figures |= {f"time/{name}": value for name, value in seconds.items()}  # [s]
         if distributed.rank() == 0:
             self.folder.log("metrics", self.steps, figures)
@@ -281,7 +280,10 @@ class Runner:
             self.algorithm.load_state_dict(stored.tensors)
             checkpoint.set_random_state(stored.tensors, stored.metadata["random"])
             self.best_score = float(stored.metadata["best_score"])
-            self.steps = self.saved = _whole_steps(stored.metadata["steps"])
+            steps = stored.metadata["steps"]
+            if type(steps) is not int or steps < 0:
+                raise ValueError(f"steps: got {steps!r}, expected a whole number")
+            self.steps = self.saved = steps
         except checkpoint.MALFORMED as error:
             raise CheckpointError(
                 f"{self.folder.last} does not fit this agent: {error}; train anew in "
@@ -294,50 +296,38 @@ class Runner:
 # -- Counting --------------------------------------------------------------------------
 
 
-@dataclass
 class StepCounts:
-    """Counts over the steps made, for the log."""
+    """Sums over the steps made, for the log."""
 
-    steps: int = 0
-    """Steps, over all envs."""
-    episodes: int = 0
-    """Episodes that ended."""
-    reward: float = 0.0
-    """Sum of the env's rewards."""
-    success: int = 0
-    """Ended episodes in which the goal was reached."""
-    exclusive: int = 0
-    """Ended episodes in which it was, and without a foul."""
-    holding: int = 0
-    """Steps in which the goal held."""
-    wrong: int = 0
-    """Steps with a finger where the goal does not allow it."""
+    def __init__(self) -> None:
+        """Start with nothing counted."""
+        self.sums = torch.zeros(7, dtype=torch.float64)
 
     def add(self, reward: Tensor, done: Tensor, info: dict[str, Tensor]) -> None:
-        """Count one step of all envs."""
-        self.steps += len(done)
-        self.episodes += int(done.sum())
-        self.reward += float(reward.sum())
-        self.success += int(info["success_once"][done].sum())
-        self.exclusive += int(info["exclusive_success"][done].sum())
-        self.holding += int(info["success"].sum())
-        self.wrong += int((info["wrong_fingers"] > 0).sum())
-
-    def over_ranks(self) -> StepCounts:
-        """Return the sums over the envs of all ranks."""
-        sums = torch.tensor(astuple(self), dtype=torch.float64)
-        return StepCounts(*distributed.gather(sums[None]).sum(dim=0).tolist())
+        """Count one step of all envs: all that is counted of episodes at their end."""
+        counted = (
+            torch.ones_like(done),
+            reward,
+            info["success"],  # the goal holds
+            info["wrong_fingers"] > 0,
+            done,
+            info["success_once"] & done,
+            info["exclusive_success"] & done,
+        )
+        self.sums += torch.stack([each.double().sum() for each in counted]).cpu()
 
     def means(self) -> Figures:
         """Return the figures per step and per episode; NaN of none that ended."""
-        episodes = self.episodes or math.nan
+        joined = distributed.gather(self.sums[None]).sum(dim=0).tolist()
+        steps, reward, holding, wrong, episodes, success, exclusive = joined
+        episodes = episodes or math.nan
         return {
-            "return": self.reward / episodes,
-            "reward": self.reward / self.steps,
-            "success": self.success / episodes,
-            "exclusive": self.exclusive / episodes,
-            "holding": self.holding / self.steps,
-            "wrong": self.wrong / self.steps,
+            "return": reward / episodes,
+            "reward": reward / steps,
+            "success": success / episodes,
+            "exclusive": exclusive / episodes,
+            "holding": holding / steps,
+            "wrong": wrong / steps,
         }
 
 
@@ -376,24 +366,6 @@ def _said(steps: int, figures: Figures) -> str:
     shares = ", ".join(f"{name} {figures[f'eval/{name}']:.0%}" for name in names)
     fingers = figures["eval/right_fingers"]
     return f" | policy at {steps}: {shares}, {fingers:.1f} fingers"
-
-
-@contextlib.contextmanager
-def threads(count: int) -> Iterator[None]:
-    """Let torch compute with that many threads."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-def _whole_steps(got: object) -> int:
-    """Return the step count of a checkpoint."""
-    if type(got) is not int or got < 0:
-        raise ValueError(f"steps: got {got!r}, expected a whole number")
-    return got
 
 
 def _entropy(*numbers: int) -> int:
