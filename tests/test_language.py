@@ -1,0 +1,395 @@
+"""The instruction language: what is said, true of a scene, and held out of training."""
+
+import json
+from importlib import resources
+from random import Random
+
+import pytest
+import torch
+
+from ir_maniskill.experiment import split_words
+from ir_maniskill.goals import (
+    COLORS,
+    DIRECTIONS,
+    EXTREMES,
+    RELATIONS,
+    SHAPES,
+    Avoid,
+    Both,
+    GoalError,
+    Push,
+    Ref,
+    Relation,
+    Then,
+    Touch,
+    left_of,
+    other_than,
+)
+from ir_maniskill.language import (
+    HELD_OBJECTS,
+    HELD_PAIRS,
+    KINDS,
+    SPLITS,
+    SentenceError,
+    Thing,
+    count,
+    counts,
+    draw,
+    handwritten,
+    parse,
+    say,
+    split_of,
+    things,
+    words,
+)
+from ir_maniskill.snapshot import Snapshot
+
+RED, BLUE = Ref("red"), Ref("blue", "cube")
+SCENE = (
+    Thing("red", "cube", 0.20, 0.10),
+    Thing("blue", "cube", 0.25, 0.00),
+    Thing("green", "button", 0.15, -0.10),
+)
+
+
+def any_ref(rng, relations=True):
+    """Return a reference drawn from all that the grammar has words for."""
+    where = None
+    if relations and rng.random() < 0.4:
+        beside = (Relation(kind, any_ref(rng, False)) for kind in RELATIONS)
+        where = rng.choice([*EXTREMES, *beside])
+    color, shape = rng.choice([None, *COLORS]), rng.choice([None, *SHAPES])
+    return Ref(color, shape, where)
+
+
+def any_act(rng):
+    """Return a touch or a push."""
+    hand, direction = rng.choice([None, "left", "right"]), rng.choice([*DIRECTIONS])
+    return rng.choice([Touch(any_ref(rng), hand), Push(any_ref(rng), direction)])
+
+
+def any_goal(rng):
+    """Return a goal of any kind, true of some scene or of none."""
+    a, b, avoid = any_act(rng), any_act(rng), Avoid(any_ref(rng))
+    return rng.choice([a, Both(a, b), Both(a, avoid), Then(a, b)])
+
+
+def any_scene(rng):
+    """Return two to five objects, which may be alike."""
+    return tuple(
+        Thing(
+            rng.choice([*COLORS]),
+            rng.choice(SHAPES),
+            rng.uniform(0.15, 0.30),
+            rng.uniform(-0.2, 0.2),
+        )
+        for _ in range(rng.randint(2, 5))
+    )
+
+
+def snapshot(scenes):
+    """Return scenes as a snapshot, each with an empty place before its objects."""
+    count = 1 + max(map(len, scenes))
+    color = torch.full((len(scenes), count), -1)
+    shape = torch.zeros_like(color)
+    start = torch.zeros(len(scenes), count, 7)
+    for n, scene in enumerate(scenes):
+        for c, thing in enumerate(scene, 1):
+            color[n, c] = [*COLORS].index(thing.color)
+            shape[n, c] = SHAPES.index(thing.shape)
+            start[n, c, :2] = torch.tensor([thing.x, thing.y])
+    rest = dict.fromkeys(("contact", "fingertip", "pose", "velocity", "stage"))
+    return Snapshot(**rest, color=color, shape=shape, start=start)
+
+
+def all_refs(goal):
+    """Return all references in a goal, also those in relations."""
+    inner = [ref.where.ref for ref in goal.refs if isinstance(ref.where, Relation)]
+    return [*goal.refs, *inner]
+
+
+def drawn(amount, split, seed=0, kinds=KINDS):
+    """Yield scenes and goals that are true of them."""
+    rng = Random(seed)
+    while amount:
+        scene = any_scene(rng)
+        try:
+            yield scene, draw(scene, kinds, rng, split)
+        except GoalError:  # nothing to say of this one
+            continue
+        amount -= 1
+
+
+# -- Saying and reading --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("wording", [False, True])
+def test_a_sentence_means_the_goal_that_it_was_said_for_and_no_other(wording):
+    rng = Random(1)
+    for _ in range(5_000):
+        goal = any_goal(rng)
+        # `parse` finds all meanings, and fails if there are two.
+        assert parse(say(goal, rng, wording)) == goal
+
+
+@pytest.mark.parametrize(
+    ("sentence", "goal"),
+    [
+        ("Touch the blue cube.", Touch(BLUE)),
+        ("  could you   tap THE RED ONE please", Touch(RED)),
+        ("hey robot, pls touch red thing", Touch(RED)),
+        ("Push the block left of the red one right.", None),
+        ("Use your left hand to touch the blue block.", Touch(BLUE, "left")),
+        ("touch the red one but not the blue cube", Both(Touch(RED), Avoid(BLUE))),
+        ("Touch the blue box before you poke the red item.", None),
+        ("Touch the cube that is not red.", Touch(Ref(None, "cube", other_than(RED)))),
+    ],
+)
+def test_sentences_read_as_people_read_them(sentence, goal):
+    others = {
+        "Push": Push(Ref(None, "cube", left_of(RED)), "right"),
+        "Touch": Then(Touch(BLUE), Touch(RED)),
+    }
+    assert parse(sentence) == (goal or others[sentence.split()[0]])
+
+
+@pytest.mark.parametrize(
+    ("sentence", "message"),
+    [
+        ("Touch the pink cube.", "got 'pink' as word 3, expected one of: block, blue"),
+        ("Push the red cube", "got the end, expected one of: away, closest"),
+        ("Touch the red cube blue", "got 'blue' as word 5, .*, the end$"),
+        ("", "got the end, expected one of: contact, could"),
+    ],
+)
+def test_what_is_not_understood_is_named_with_what_was_expected(sentence, message):
+    with pytest.raises(SentenceError, match=message):
+        parse(sentence)
+
+
+@pytest.mark.parametrize(
+    "goal",
+    [
+        Push(RED, "left", 0.1),
+        Avoid(RED),
+        Touch(Ref(where=left_of(Ref(where="leftmost")))),
+        Then(Touch(RED), Then(Touch(RED), Touch(BLUE))),
+    ],
+)
+def test_a_goal_without_words_is_refused(goal):
+    with pytest.raises(GoalError, match="say: got .*, expected what the grammar"):
+        say(goal, Random(0))
+
+
+def test_all_sentences_of_a_goal_are_said_and_counted():
+    rng = Random(0)
+    goal = Touch(Ref(shape="cube"))
+    # 1 + 4 + 2 + 1 + 2 kinds of politeness, 4 + 1 + 4 verbs, "cube" and "block".
+    assert count(goal) == 10 * 9 * 2
+    assert len({say(goal, rng) for _ in range(40_000)}) == count(goal)
+
+
+def test_all_colors_shapes_and_directions_have_words():
+    rng = Random(0)
+    for color in COLORS:
+        for shape in SHAPES:
+            for direction in DIRECTIONS:
+                say(Push(Ref(color, shape), direction), rng)
+
+
+# -- Drawing -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("split", ["train", "objects", "pairs"])
+def test_every_reference_of_a_drawn_goal_fits_one_object(split):
+    scenes, goals = zip(*drawn(200, split), strict=True)
+    rows = snapshot(scenes)
+    assert things(rows)[0] == tuple(
+        t._replace(x=pytest.approx(t.x), y=pytest.approx(t.y)) for t in scenes[0]
+    )
+    for ref in {ref for goal in goals for ref in all_refs(goal)}:
+        asked = torch.tensor([ref in all_refs(goal) for goal in goals])
+        assert (ref.resolve(rows).sum(dim=1)[asked] == 1).all(), ref
+
+
+def test_drawn_goals_are_of_the_kind_asked_and_can_be_done():
+    shown = {kind: {g for _, g in drawn(400, "train", 2, [kind])} for kind in KINDS}
+    assert all(isinstance(g, Touch) and not g.hand for g in shown["touch"])
+    assert {g.hand for g in shown["hand"]} == {"left", "right"}
+    assert {g.direction for g in shown["push"]} == {*DIRECTIONS}
+    hows = {
+        "avoid" if isinstance(g, Both) else getattr(g.ref.where, "kind", g.ref.where)
+        for g in shown["where"]
+    }
+    assert hows == {"avoid", *EXTREMES, *RELATIONS}
+    assert all(
+        g.a.hand is g.b.hand is None or g.a.hand != g.b.hand for g in shown["both"]
+    )
+    assert all(isinstance(g, Then) for g in shown["then"])
+    pushed = [g.ref for g in shown["push"]] + [
+        p.ref for g in shown["then"] for p in g.parts if isinstance(p, Push)
+    ]
+    assert all(ref.shape != "button" for ref in pushed)
+
+
+def test_a_button_is_not_pushed_even_if_only_its_color_is_said():
+    with pytest.raises(GoalError, match="got a scene of green button, expected one"):
+        draw(SCENE[2:], ["push"], Random(0))
+
+
+def test_relations_are_clear_to_see():
+    near = (SCENE[0], SCENE[0]._replace(color="green", y=0.09, x=0.21))
+    wheres = {
+        g.ref.where
+        for seed in range(200)
+        for g in [draw(near, ["where"], Random(seed))]
+        if isinstance(g, Touch | Push)
+    }
+    assert {getattr(where, "kind", where) for where in wheres} == {"other_than"}
+
+
+def test_the_same_seed_draws_the_same():
+    def once():
+        rng = Random(5)
+        return [say(draw(SCENE, KINDS, rng), rng) for _ in range(50)]
+
+    assert once() == once()
+
+
+@pytest.mark.parametrize(
+    ("kinds", "split", "message"),
+    [
+        (["dance"], "train", "kind: got 'dance', available: touch, hand"),
+        (["touch"], "test", "split: got 'test', available: train, wording"),
+    ],
+)
+def test_unknown_kinds_and_splits_are_refused(kinds, split, message):
+    with pytest.raises(GoalError, match=message):
+        draw(SCENE, kinds, Random(0), split)
+
+
+# -- Splits --------------------------------------------------------------------------
+
+
+def of_training(sentence):
+    """Return whether training may say a sentence."""
+    try:
+        return split_of(parse(sentence, wording=False)) == "train"
+    except SentenceError:
+        return False
+
+
+def test_training_never_means_what_is_held_out():
+    rng, known = Random(0), set(words())
+    for number, (scene, goal) in enumerate(drawn(20_000, "train", 3)):
+        meant = scene_of(goal, scene)
+        assert split_of(goal) == "train"
+        assert not {t[:2] for t, _ in meant} & HELD_OBJECTS
+        assert not {(verb, t.color) for t, verb in meant} & HELD_PAIRS
+        if number % 10 == 0:
+            text = say(goal, rng)
+            assert of_training(text)
+            assert set(split_words(text)) <= known
+
+
+def scene_of(goal, scene):
+    """Return the objects that a goal means, each with what is done to it."""
+    found = []
+    for part in goal.parts or (goal,):
+        verb = "leave"
+        if isinstance(part, Push):
+            verb = f"push {part.direction}"
+        elif isinstance(part, Touch):
+            verb = f"{part.hand} hand" if part.hand else "touch"
+        where = part.ref.where
+        refs = [part.ref] + ([where.ref] if isinstance(where, Relation) else [])
+        for ref in refs:
+            fits = fitting(ref, scene)
+            found.append((fits, verb if ref is part.ref else "find"))
+    return found
+
+
+def fitting(ref, scene):
+    """Return the object that a reference fits, found the slow way."""
+    fits = [
+        t
+        for t in scene
+        if ref.color in (None, t.color) and ref.shape in (None, t.shape)
+    ]
+    if isinstance(ref.where, str):
+        axis, sign = EXTREMES[ref.where]
+        fits = [max(fits, key=lambda t: sign * t[2 + axis])]
+    elif ref.where:
+        other = fitting(ref.where.ref, scene)
+        fits = [
+            t
+            for t in fits
+            if t is not other
+            and {
+                "left_of": t.y > other.y,
+                "right_of": t.y < other.y,
+                "other_than": True,
+            }[ref.where.kind]
+        ]
+    (one,) = fits
+    return one
+
+
+@pytest.mark.parametrize("split", ["objects", "pairs"])
+def test_goals_of_a_split_say_what_training_never_says(split):
+    rng = Random(0)
+    for _, goal in drawn(1_000, split, 4):
+        assert split_of(goal) == split
+        assert not of_training(say(goal, rng))
+
+
+def test_each_kind_can_be_drawn_in_each_split():
+    for split in SPLITS:
+        for kind in KINDS:
+            assert next(drawn(1, split, kinds=[kind]))
+
+
+def test_held_out_wording_is_never_said_in_training():
+    rng = Random(0)
+    for _, goal in drawn(1_000, "wording", 5):
+        assert split_of(goal) == "train"
+        assert not of_training(say(goal, rng, wording=True))
+
+
+def test_sentences_written_by_hand_are_new_in_wording_alone():
+    texts = [instruction.text for instruction in handwritten()]
+    assert len({tuple(split_words(text)) for text in texts}) == len(texts) >= 150
+    assert not [text for text in texts if of_training(text)]
+    assert {split_of(instruction.goal) for instruction in handwritten()} == {"train"}
+    for instruction in handwritten():  # what is understood is understood right
+        try:
+            assert parse(instruction.text) == instruction.goal, instruction.text
+        except SentenceError:
+            continue
+
+
+def test_phrases_are_marked_and_held_out_words_are_new():
+    assert len(words()) >= 40
+    assert not {"crimson", "shove", "poke", "simultaneously"} & set(words())
+    assert set(words()) < set(words("wording"))
+    missing = {"can", "pyramid"} - set(SHAPES)
+    assert not missing & set(words())
+
+
+def test_counts_of_splits():
+    kinds = ("touch", "push")
+    train, new = counts("train", kinds), counts("objects", kinds)
+    held = [thing for thing in HELD_OBJECTS if thing[1] in SHAPES]
+    # All names, but not those held out, nor those that say "orange".
+    names = len(COLORS) * len(SHAPES) + len(COLORS) + len(SHAPES)
+    orange, both = len(SHAPES) + 1, sum(color == "orange" for color, _ in held)
+    assert train["touch"][0] == names - len(held) - orange + both
+    assert new["touch"][0] == len(held) - both
+    assert all(sentences > 4_000 for _, sentences in train.values())
+    assert counts("places", kinds) == train
+
+
+def test_the_tables_are_ready_for_more_shapes():
+    path = resources.files("ir_maniskill.language") / "grammar.json"
+    shapes = json.loads(path.read_text())["words"]["shape"]
+    assert {"cube", "button", "can", "pyramid"} <= shapes.keys()
