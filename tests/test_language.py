@@ -42,6 +42,7 @@ from ir_maniskill.language import (
     things,
     words,
 )
+from ir_maniskill.language.grammar import RULES
 from ir_maniskill.snapshot import Snapshot
 
 RED, BLUE = Ref("red"), Ref("blue", "cube")
@@ -56,22 +57,26 @@ def any_ref(rng, relations=True):
     """Return a reference drawn from all that the grammar has words for."""
     where = None
     if relations and rng.random() < 0.4:
-        beside = (Relation(kind, any_ref(rng, False)) for kind in RELATIONS)
-        where = rng.choice([*EXTREMES, *beside])
+        where = rng.choice([*EXTREMES, *RELATIONS])
+        if where in RELATIONS:
+            where = Relation(where, any_ref(rng, relations=False))
     color, shape = rng.choice([None, *COLORS]), rng.choice([None, *SHAPES])
     return Ref(color, shape, where)
 
 
 def any_act(rng):
     """Return a touch or a push."""
-    hand, direction = rng.choice([None, "left", "right"]), rng.choice([*DIRECTIONS])
-    return rng.choice([Touch(any_ref(rng), hand), Push(any_ref(rng), direction)])
+    if rng.random() < 0.5:
+        return Touch(any_ref(rng), rng.choice([None, "left", "right"]))
+    return Push(any_ref(rng), rng.choice([*DIRECTIONS]))
 
 
 def any_goal(rng):
     """Return a goal of any kind, true of some scene or of none."""
-    a, b, avoid = any_act(rng), any_act(rng), Avoid(any_ref(rng))
-    return rng.choice([a, Both(a, b), Both(a, avoid), Then(a, b)])
+    how, a = rng.randrange(4), any_act(rng)
+    if how < 2:
+        return a if how else Both(a, Avoid(any_ref(rng)))
+    return rng.choice([Both, Then])(a, any_act(rng))
 
 
 def any_scene(rng):
@@ -120,6 +125,40 @@ def drawn(amount, split, seed=0, kinds=KINDS):
         amount -= 1
 
 
+def meant(goal, scene):
+    """Return the objects that a goal means, each with what is done to it."""
+    found = []
+    for part in goal.parts or (goal,):
+        verb = "leave"
+        if isinstance(part, Push):
+            verb = f"push {part.direction}"
+        elif isinstance(part, Touch):
+            verb = f"{part.hand} hand" if part.hand else "touch"
+        found.append((verb, fitting(part.ref, scene)))
+        if isinstance(part.ref.where, Relation):
+            found.append(("find", fitting(part.ref.where.ref, scene)))
+    return found
+
+
+def fitting(ref, scene):
+    """Return the one object that a reference fits, found the slow way."""
+    color, shape, where = ref.color, ref.shape, ref.where
+    fits = [t for t in scene if color in (None, t.color) and shape in (None, t.shape)]
+    if isinstance(where, str):
+        axis, sign = EXTREMES[where]
+        fits = [max(fits, key=lambda t: sign * t[2 + axis])]
+    elif where:
+        other = fitting(where.ref, scene)
+        side = {
+            "left_of": lambda t: t.y > other.y,
+            "right_of": lambda t: t.y < other.y,
+            "other_than": lambda t: t is not other,
+        }
+        fits = list(filter(side[where.kind], fits))
+    (one,) = fits
+    return one
+
+
 # -- Saying and reading --------------------------------------------------------------
 
 
@@ -138,19 +177,21 @@ def test_a_sentence_means_the_goal_that_it_was_said_for_and_no_other(wording):
         ("Touch the blue cube.", Touch(BLUE)),
         ("  could you   tap THE RED ONE please", Touch(RED)),
         ("hey robot, pls touch red thing", Touch(RED)),
-        ("Push the block left of the red one right.", None),
+        (
+            "Push the block left of the red one right.",
+            Push(Ref(None, "cube", left_of(RED)), "right"),
+        ),
         ("Use your left hand to touch the blue block.", Touch(BLUE, "left")),
         ("touch the red one but not the blue cube", Both(Touch(RED), Avoid(BLUE))),
-        ("Touch the blue box before you poke the red item.", None),
+        (
+            "Touch the blue box before you poke the red item.",
+            Then(Touch(BLUE), Touch(RED)),
+        ),
         ("Touch the cube that is not red.", Touch(Ref(None, "cube", other_than(RED)))),
     ],
 )
 def test_sentences_read_as_people_read_them(sentence, goal):
-    others = {
-        "Push": Push(Ref(None, "cube", left_of(RED)), "right"),
-        "Touch": Then(Touch(BLUE), Touch(RED)),
-    }
-    assert parse(sentence) == (goal or others[sentence.split()[0]])
+    assert parse(sentence) == goal
 
 
 @pytest.mark.parametrize(
@@ -186,7 +227,8 @@ def test_all_sentences_of_a_goal_are_said_and_counted():
     goal = Touch(Ref(shape="cube"))
     # 1 + 4 + 2 + 1 + 2 kinds of politeness, 4 + 1 + 4 verbs, "cube" and "block".
     assert count(goal) == 10 * 9 * 2
-    assert len({say(goal, rng) for _ in range(40_000)}) == count(goal)
+    said = {say(goal, rng) for _ in range(10_000)}
+    assert 0.9 * count(goal) < len(said) <= count(goal)
 
 
 def test_all_colors_shapes_and_directions_have_words():
@@ -282,57 +324,14 @@ def of_training(sentence):
 def test_training_never_means_what_is_held_out():
     rng, known = Random(0), set(words())
     for number, (scene, goal) in enumerate(drawn(20_000, "train", 3)):
-        meant = scene_of(goal, scene)
+        acts = meant(goal, scene)
         assert split_of(goal) == "train"
-        assert not {t[:2] for t, _ in meant} & HELD_OBJECTS
-        assert not {(verb, t.color) for t, verb in meant} & HELD_PAIRS
+        assert not {thing[:2] for _, thing in acts} & HELD_OBJECTS
+        assert not {(verb, thing.color) for verb, thing in acts} & HELD_PAIRS
         if number % 10 == 0:
             text = say(goal, rng)
             assert of_training(text)
             assert set(split_words(text)) <= known
-
-
-def scene_of(goal, scene):
-    """Return the objects that a goal means, each with what is done to it."""
-    found = []
-    for part in goal.parts or (goal,):
-        verb = "leave"
-        if isinstance(part, Push):
-            verb = f"push {part.direction}"
-        elif isinstance(part, Touch):
-            verb = f"{part.hand} hand" if part.hand else "touch"
-        where = part.ref.where
-        refs = [part.ref] + ([where.ref] if isinstance(where, Relation) else [])
-        for ref in refs:
-            fits = fitting(ref, scene)
-            found.append((fits, verb if ref is part.ref else "find"))
-    return found
-
-
-def fitting(ref, scene):
-    """Return the object that a reference fits, found the slow way."""
-    fits = [
-        t
-        for t in scene
-        if ref.color in (None, t.color) and ref.shape in (None, t.shape)
-    ]
-    if isinstance(ref.where, str):
-        axis, sign = EXTREMES[ref.where]
-        fits = [max(fits, key=lambda t: sign * t[2 + axis])]
-    elif ref.where:
-        other = fitting(ref.where.ref, scene)
-        fits = [
-            t
-            for t in fits
-            if t is not other
-            and {
-                "left_of": t.y > other.y,
-                "right_of": t.y < other.y,
-                "other_than": True,
-            }[ref.where.kind]
-        ]
-    (one,) = fits
-    return one
 
 
 @pytest.mark.parametrize("split", ["objects", "pairs"])
@@ -368,7 +367,13 @@ def test_sentences_written_by_hand_are_new_in_wording_alone():
             continue
 
 
-def test_phrases_are_marked_and_held_out_words_are_new():
+def test_no_phrase_is_listed_twice():
+    for symbol, phrases in RULES.items():
+        listed = [phrase.items for phrase in phrases]
+        assert len(set(listed)) == len(listed), symbol
+
+
+def test_held_out_words_are_new():
     assert len(words()) >= 40
     assert not {"crimson", "shove", "poke", "simultaneously"} & set(words())
     assert set(words()) < set(words("wording"))

@@ -250,5 +250,5 @@ _DRAW: dict[str, Callable[[_Scene, Random], Goal | None]] = {
     **{kind: partial(_one, verbs=verbs) for kind, verbs in VERBS.items()},
     "where": _where,
     "both": partial(_two, kind=Both, verbs=[((a,), (b,)) for a, b in TEAMS]),
-    "then": partial(_two, kind=Then, verbs=[*product(VERBS.values(), repeat=2)]),
+    "then": partial(_two, kind=Then, verbs=[*product(VERBS.values(), VERBS.values())]),
 }

@@ -39,8 +39,9 @@ Slots = dict[str, Any]
 MARKS = ("train", "wording", "typed")
 """Whether a phrase is said in training, held out, or understood and never said."""
 
-SAID = MARKS[:2]
-"""What `say` says."""
+TRAIN = ("train",)
+SAID = ("train", "wording")
+"""What is said in training, and what at all."""
 
 SYMBOLS = {"a": "act", "b": "act", "other": "ref"}
 """What a slot stands for, where that is not its name."""
@@ -264,7 +265,7 @@ def say(goal: Goal, rng: Random, wording: bool = False) -> str:
 
 def count(goal: Goal, wording: bool = False) -> int:
     """Return how many sentences `say` has for a goal."""
-    trained = _ways("sentence", goal, MARKS[:1])
+    trained = _ways("sentence", goal, TRAIN)
     return _ways("sentence", goal, SAID) - trained if wording else trained
 
 
@@ -345,7 +346,7 @@ def parse(sentence: str, wording: bool = True) -> Goal:
     Raises:
         SentenceError: It is not understood.
     """
-    reader = _Reader(words := split_words(sentence), MARKS if wording else MARKS[:1])
+    reader = _Reader(words := split_words(sentence), MARKS if wording else TRAIN)
     goals = {goal for end, goal in reader.read("sentence", 0) if end == len(words)}
     if not goals:
         raise SentenceError(f"sentence {sentence!r}: {_complaint(reader)}")
@@ -358,7 +359,7 @@ def parse(sentence: str, wording: bool = True) -> Goal:
 def _complaint(reader: _Reader) -> str:
     """Return what was got and what was expected, in words of training if possible."""
     at, got = reader.far, reader.words[reader.far]
-    plain = _Reader(reader.words[:-1], MARKS[:1])
+    plain = _Reader(reader.words[:-1], TRAIN)
     plain.read("sentence", 0)
     expected = sorted(plain.expected if plain.far == at else reader.expected)
     known = [word for word in expected if word in words_by_mark("train")]
