@@ -28,7 +28,16 @@ PAGE, INK, FAINT = (18, 20, 24), (238, 240, 244), (150, 156, 168)
 GAP = 16
 """Between pictures [pixel]."""
 CLOSE = ((0.74, 0.34, 0.40), (0.06, 0.0, 0.08))
-"""Eye and target of the pictures of the scenes [m]."""
+"""Eye and target of the picture of the robot [m]."""
+ABOVE = ((0.56, 0.0, 0.62), (0.12, 0.0, 0.05))
+"""Eye and target of the pictures of the tasks [m]."""
+LAYOUTS = {
+    "Single": "one sentence",
+    "Multi": "three sentences",
+    "Triangle": "a reward for each finger",
+    "Shuffled": "colors change places",
+}
+"""What tells the tasks apart."""
 FILMS = (
     "NaoTouchCubeSingle-v1",
     "NaoTouchCubeMulti-v1",
@@ -41,13 +50,15 @@ FILMS = (
 """The tasks of which there is a film."""
 
 
-def shoot(task: str, size: tuple[int, int]) -> tuple[Image.Image, list[Image.Image]]:
+def shoot(
+    task: str, size: tuple[int, int], seen_from: tuple = CLOSE, seed: int = 1
+) -> tuple[Image.Image, list[Image.Image]]:
     """Return the human view of a task's start, and what the two cameras see."""
     width, height = size
     camera = {
         "width": 2 * width,  # drawn large and shrunk, for smooth edges
         "height": 2 * height,
-        "pose": look_at(*CLOSE),
+        "pose": look_at(*seen_from),
         "fov": 0.56,
     }
     env: Any = gym.make(
@@ -57,7 +68,7 @@ def shoot(task: str, size: tuple[int, int]) -> tuple[Image.Image, list[Image.Ima
         enable_shadow=True,
         human_render_camera_configs=camera,
     )
-    obs, _ = env.reset(seed=1, options={"instruction": 0})
+    obs, _ = env.reset(seed=seed, options={"instruction": 0})
     view = Image.fromarray(env.render()[0].cpu().numpy()).resize(size)
     eyes = [
         Image.fromarray(obs["sensor_data"][name]["rgb"][0].cpu().numpy())
@@ -88,18 +99,18 @@ def hero() -> Image.Image:
 
 
 def scenes() -> Image.Image:
-    """Return the four layouts in a row."""
-    tasks = [
-        f"NaoTouch{shape}{layout}-v1"
-        for layout in ("Multi", "Triangle")
-        for shape in ("Cube", "Button")
-    ]
-    width, height = 320, 240
-    page = Image.new("RGB", (GAP + 4 * (width + GAP), 40 + height + GAP), PAGE)
-    for index, task in enumerate(tasks):
-        left = GAP + index * (width + GAP)
-        label(page, (left, 22), task, 14)
-        page.paste(shoot(task, (width, height))[0], (left, 40))
+    """Return all tasks, a column for each layout."""
+    width, height, head = 300, 225, 56
+    page = Image.new("RGB", (GAP + 4 * (width + GAP), head + 2 * (height + GAP)), PAGE)
+    for column, (layout, said) in enumerate(LAYOUTS.items()):
+        left = GAP + column * (width + GAP)
+        label(page, (left, 18), layout, 22)
+        label(page, (left, 42), said, 14)
+        for row, shape in enumerate(("Cube", "Button")):
+            task = f"NaoTouch{shape}{layout}-v1"
+            seed = 3 if layout == "Shuffled" else 1
+            view, _ = shoot(task, (width, height), ABOVE, seed)
+            page.paste(view, (left, head + row * (height + GAP)))
     return page
 
 
