@@ -6,7 +6,6 @@ takes turns in short blocks, medians are taken, and the ratio is what counts.
 
 from __future__ import annotations
 
-import json
 import os
 import statistics
 import tempfile
@@ -22,6 +21,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from ir_maniskill.checks import require
 from ir_maniskill.environment.vector import make_vec
 from ir_maniskill.evaluation.evaluate import machine, versions
 from ir_maniskill.training.config import CONFIGS, TrainConfig
@@ -101,6 +101,7 @@ def run(seconds: float = 10.0, quick: bool = False) -> Report:
         quick: Whether to measure as briefly as possible, without the peer, which takes
             long to load.
     """
+    require(0 < seconds <= 600, "seconds", seconds, "up to 600")
     seconds = 1.0 if quick else seconds
     jobs: tuple[Callable[[], Iterator[Row]], ...] = (
         lambda: one_env("state", seconds, peer=not quick),
@@ -295,9 +296,3 @@ def stepping_many(envs: Any) -> Block:
     return lambda: timed(
         lambda: [envs.step(action) for action in plan], EPISODE * envs.num_envs
     )
-
-
-def save(report: Report, path: Path) -> None:
-    """Write the report as JSON."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(report.as_dict(), indent=2) + "\n")
