@@ -90,21 +90,11 @@ def record(
 ) -> Path:
     """Film a policy, what it sees and what it feels (.mp4 or .gif); return the file.
 
-    Args:
-        policy: The policy, its file, or the id of a task whose policy ships.
-        path: The file to write.
-        task: Id of the task to play; None: the one that it was trained for.
-        episodes: How many; the sentences take turns.
-        seed: Seed of the first episode; episode e starts from seed + e.
-        speed: How fast to play, 0.05 to 4; 1 is real time.
-        instruction: Show this sentence alone; None: all of the task's.
-        any_task: Accept a policy that was trained for another task.
+    What it takes and raises is what `evaluate` does, and: `path` is the file to write,
+    the sentences take turns, and `speed` is 0.05 to 4, of which 1 is real time.
 
     Raises:
-        CheckpointError: There is no such policy.
-        MismatchError: It was trained for another task, robot or vocabulary.
         OSError: The film cannot be written.
-        ValueError: There is no such sentence, or another argument cannot be used.
     """
     path = Path(path)
     video.check_name(path)

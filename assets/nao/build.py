@@ -5,13 +5,13 @@ else is merged, in the posture of `facts/posture.csv`, into the link `torso`.
 """
 
 import argparse
-import math
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable
 from itertools import combinations_with_replacement
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from . import facts
 from .facts import Frames, Inertial, Row
@@ -90,12 +90,13 @@ def urdf() -> str:
     """Return the text of the URDF."""
     joints, driven = facts.read_joints(), facts.read("actuation")
     moving = [joints[row["joint"]]["child_link"] for row in driven]
-    robot = ET.Element("robot", name="nao")
-    robot.append(ET.Comment(" Written by build.py: change that, not this. "))
-    for link, inertial in link_inertials(moving).items():
-        robot.append(_link(link, inertial))
-    for row in driven:
-        robot.append(_joint(joints[row["joint"]], row))
+    robot = _node(
+        "robot",
+        ET.Comment(" Written by build.py: change that, not this. "),
+        *(_link(name, inertial) for name, inertial in link_inertials(moving).items()),
+        *(_joint(joints[row["joint"]], row) for row in driven),
+        name="nao",
+    )
     ET.indent(robot)
     return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
 
@@ -135,66 +136,63 @@ def _shapes_of(link: str) -> tuple[Shape, ...]:
     return tuple(((x, side * y, z), size) for (x, y, z), size in shapes)
 
 
+def _node(tag: str, *children: Any, **attributes: ArrayLike) -> ET.Element:
+    """Return an XML element with what is inside."""
+    node = ET.Element(tag, {name: _text(value) for name, value in attributes.items()})
+    node.extend(children)
+    return node
+
+
+def _text(value: ArrayLike) -> str:
+    if isinstance(value, str):
+        return value
+    # Rounded first, so that what should be zero is zero on every machine.
+    return " ".join(f"{round(x, 15) + 0.0:.6g}" for x in np.atleast_1d(value))
+
+
 def _link(name: str, inertial: Inertial) -> ET.Element:
-    link = ET.Element("link", name=name)
-    link.append(_inertial(inertial))
+    parts = [_inertial(inertial)]
     if mesh := _mesh_of(name):
-        geometry = ET.SubElement(ET.SubElement(link, "visual"), "geometry")
-        ET.SubElement(geometry, "mesh", filename=f"meshes/{mesh}.glb")
-    link.extend(_collision(shape) for shape in _shapes_of(name))
-    return link
+        geometry = _node("geometry", _node("mesh", filename=f"meshes/{mesh}.glb"))
+        parts.append(_node("visual", geometry))
+    return _node("link", *parts, *map(_collision, _shapes_of(name)), name=name)
 
 
 def _inertial(inertial: Inertial) -> ET.Element:
-    element = ET.Element("inertial")
-    ET.SubElement(element, "origin", xyz=_text(inertial.com), rpy="0 0 0")
-    ET.SubElement(element, "mass", value=_text([inertial.mass]))
-    upper = combinations_with_replacement(range(3), 2)
-    tensor = {
-        f"i{'xyz'[i]}{'xyz'[j]}": _text([inertial.inertia[i, j]]) for i, j in upper
-    }
-    ET.SubElement(element, "inertia", tensor)
-    return element
+    pairs = combinations_with_replacement(range(3), 2)
+    tensor = {f"i{'xyz'[i]}{'xyz'[j]}": inertial.inertia[i, j] for i, j in pairs}
+    return _node(
+        "inertial",
+        _node("origin", xyz=inertial.com, rpy="0 0 0"),
+        _node("mass", value=inertial.mass),
+        _node("inertia", **tensor),
+    )
 
 
 def _collision(shape: Shape) -> ET.Element:
     center, size = shape
-    element = ET.Element("collision")
-    ET.SubElement(element, "origin", xyz=_text(center), rpy="0 0 0")
-    geometry = ET.SubElement(element, "geometry")
-    if isinstance(size, tuple):
-        ET.SubElement(geometry, "box", size=_text(size))
-    else:
-        ET.SubElement(geometry, "sphere", radius=_text([size]))
-    return element
+    box = isinstance(size, tuple)
+    solid = _node("box", size=size) if box else _node("sphere", radius=size)
+    origin = _node("origin", xyz=center, rpy="0 0 0")
+    return _node("collision", origin, _node("geometry", solid))
 
 
 def _joint(row: Row, actuation: Row) -> ET.Element:
-    joint = ET.Element("joint", name=row["joint"], type="revolute")
-    ET.SubElement(joint, "parent", link=row["parent_link"])
-    ET.SubElement(joint, "child", link=row["child_link"])
+    names = ("lower_deg", "upper_deg", "effort_nm", "velocity_rad_s")
+    lower, upper, effort, velocity = facts.vector(actuation, *names)
     xyz = " ".join(row[f"origin_{axis}_m"] for axis in "xyz")
     rpy = " ".join(row[f"{angle}_rad"] for angle in ("roll", "pitch", "yaw"))
-    ET.SubElement(joint, "origin", xyz=xyz, rpy=rpy)
-    axis = facts.vector(row, "axis_x", "axis_y", "axis_z")
-    ET.SubElement(joint, "axis", xyz=_text(axis))
-    lower, upper, effort, velocity = facts.vector(
-        actuation, "lower_deg", "upper_deg", "effort_nm", "velocity_rad_s"
+    limits = {"lower": np.radians(lower), "upper": np.radians(upper)}
+    return _node(
+        "joint",
+        _node("parent", link=row["parent_link"]),
+        _node("child", link=row["child_link"]),
+        _node("origin", xyz=xyz, rpy=rpy),
+        _node("axis", xyz=facts.vector(row, "axis_x", "axis_y", "axis_z")),
+        _node("limit", **limits, effort=effort, velocity=velocity),
+        name=row["joint"],
+        type="revolute",
     )
-    ET.SubElement(
-        joint,
-        "limit",
-        lower=_text([math.radians(lower)]),
-        upper=_text([math.radians(upper)]),
-        effort=_text([effort]),
-        velocity=_text([velocity]),
-    )
-    return joint
-
-
-def _text(values: Iterable[float]) -> str:
-    # Rounded first, so that what should be zero is zero on every machine.
-    return " ".join(f"{round(value, 15) + 0.0:.6g}" for value in values)
 
 
 if __name__ == "__main__":
