@@ -7,7 +7,6 @@ python docs/make_images.py nao NaoTouchCubeMulti-v1  # these
 import argparse
 from collections.abc import Callable
 from functools import partial
-from importlib.resources import files
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.senses import cameras
 from ir_maniskill.evaluation.evaluate import EVALUATION_SEED
 from ir_maniskill.evaluation.video import record, write_video
-from ir_maniskill.training.checkpoint import load_policy
+from ir_maniskill.policy import load_policy
 
 FOLDER = Path(__file__).parent / "images"
 PAGE, INK, FAINT = (18, 20, 24), (238, 240, 244), (150, 156, 168)
@@ -122,16 +121,15 @@ def save(make: Callable[[], Image.Image], path: Path) -> None:
 
 def film(task: str, path: Path) -> None:
     """Write a film of the shipped policy, told every sentence in the same scene."""
-    folder = Path(str(files("ir_maniskill.assets") / "policies"))
-    agent, config, _ = load_policy(folder / f"{task}.safetensors")
+    policy = load_policy(task)
     play = partial(
         record,
-        agent.policy,
+        policy.agent.policy,
         task,
         episodes=1,
         seed=EVALUATION_SEED,
-        frames=config.frames,
-        env_kwargs=config.env_kwargs(training=False),
+        frames=policy.config.frames,
+        env_kwargs=policy.env_kwargs,
     )
     told = range(len(catalog.get(task).sentences))
     write_video(path, chain.from_iterable(play(instructions=[i]) for i in told))

@@ -8,12 +8,14 @@ function from the state s_t to actions in [-1, 1] can stand in its place. The ta
 the one that the policy learned, unless another is named.
 """
 
+from contextlib import closing
 from pathlib import Path
 
 import torch
 import tyro
 from torch import Tensor
 
+from ir_maniskill import make_vec
 from ir_maniskill.evaluation.evaluate import (
     EVALUATION_SEED,
     evaluate_policy,
@@ -44,15 +46,10 @@ def main(
     task = task or config.env_id
     env_kwargs = config.env_kwargs(training=False)
     seed, frames = EVALUATION_SEED, config.frames
-    report = evaluate_policy(
-        policy,
-        task,
-        episodes=episodes,
-        seed=seed,
-        frames=frames,
-        env_kwargs=env_kwargs,
-        progress=True,
-    )
+    with closing(make_vec(task, min(8, episodes), **env_kwargs)) as envs:
+        report = evaluate_policy(
+            policy, envs, episodes=episodes, seed=seed, frames=frames, progress=True
+        )
     print(report)
     write_report(out / "report.json", report, checkpoint=str(checkpoint))
     steps = record(

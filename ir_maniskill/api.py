@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 from ir_maniskill import experiment as catalog
+from ir_maniskill.checks import require
+from ir_maniskill.environment.vector import make_vec
 from ir_maniskill.evaluation import video
 from ir_maniskill.evaluation.evaluate import (
     EVALUATION_SEED,
     EvaluationReport,
+    choose_instructions,
     evaluate_policy,
 )
 from ir_maniskill.experiment import Experiment
+from ir_maniskill.files import require_writable
 from ir_maniskill.policy import Policy, load_policy
 from ir_maniskill.training.checkpoint import MismatchError
 
@@ -54,18 +59,22 @@ def evaluate(
         ValueError: There is no such sentence, or too few episodes.
     """
     robot = env_kwargs.get("robot_uids")
-    policy, experiment = _matched(policy, task, any_task, robot)
-    return evaluate_policy(
-        policy.agent.policy,
-        experiment.id,
-        episodes=episodes,
-        seed=seed,
-        num_envs=num_envs,
-        frames=policy.config.frames,
-        env_kwargs={**policy.env_kwargs, **env_kwargs},
-        instructions=_chosen(experiment, instruction),
-        progress=progress,
+    require(num_envs >= 1, "num_envs", num_envs, "at least 1")
+    policy, experiment, chosen = _prepare(
+        policy, task, any_task, episodes, seed, instruction, robot
     )
+    kwargs = {**policy.env_kwargs, **env_kwargs}
+    # More envs than episodes would play what nobody counts.
+    with closing(make_vec(experiment.id, min(num_envs, episodes), **kwargs)) as envs:
+        return evaluate_policy(
+            policy.agent.policy,
+            envs,
+            episodes=episodes,
+            seed=seed,
+            frames=policy.config.frames,
+            instructions=chosen,
+            progress=progress,
+        )
 
 
 def record(
@@ -81,30 +90,19 @@ def record(
 ) -> Path:
     """Film a policy, what it sees and what it feels (.mp4 or .gif); return the file.
 
-    Args:
-        policy: The policy, its file, or the id of a task whose policy ships.
-        path: The file to write.
-        task: Id of the task to play; None: the one that it was trained for.
-        episodes: How many; the sentences take turns.
-        seed: Seed of the first episode; episode e starts from seed + e.
-        speed: How fast to play, 0.05 to 4; 1 is real time.
-        instruction: Show this sentence alone; None: all of the task's.
-        any_task: Accept a policy that was trained for another task.
+    What it takes and raises is what `evaluate` does, and: `path` is the file to write,
+    the sentences take turns, and `speed` is 0.05 to 4, of which 1 is real time.
 
     Raises:
-        CheckpointError: There is no such policy.
-        MismatchError: It was trained for another task, robot or vocabulary.
         OSError: The film cannot be written.
-        ValueError: There is no such sentence, or another argument cannot be used.
     """
     path = Path(path)
     video.check_name(path)
-    if episodes < 1 or not 0.05 <= speed <= 4:
-        raise ValueError(
-            f"episodes, speed: got {episodes}, {speed:g}, expected at least 1, "
-            "and 0.05 to 4"
-        )
-    policy, experiment = _matched(policy, task, any_task)
+    require(0.05 <= speed <= 4, "speed", speed, "0.05 to 4")
+    policy, experiment, chosen = _prepare(
+        policy, task, any_task, episodes, seed, instruction
+    )
+    require_writable(path)
     steps = video.record(
         policy.agent.policy,
         experiment.id,
@@ -112,16 +110,24 @@ def record(
         seed=seed,
         frames=policy.config.frames,
         env_kwargs=policy.env_kwargs,
-        instructions=_chosen(experiment, instruction),
+        instructions=chosen,
     )
     video.write_video(path, steps, speed=speed)
     return path
 
 
-def _matched(
-    policy: PolicyLike, task: str | None, any_task: bool, robot: str | None = None
-) -> tuple[Policy, Experiment]:
-    """Return the policy, and the task that it shall play."""
+def _prepare(
+    policy: PolicyLike,
+    task: str | None,
+    any_task: bool,
+    episodes: int,
+    seed: int,
+    instruction: str | None,
+    robot: str | None = None,
+) -> tuple[Policy, Experiment, tuple[int, ...]]:
+    """Check what both ask for; return the policy, the task and its sentences."""
+    require(episodes >= 1, "episodes", episodes, "at least 1")
+    require(seed >= 0, "seed", seed, "at least 0")
     if not isinstance(policy, Policy):
         policy = load_policy(policy)
     experiment = catalog.get(task or policy.env_id)
@@ -130,16 +136,5 @@ def _matched(
     except MismatchError as error:
         hint = "" if any_task else "; name its task, or use any_task to try it here"
         raise MismatchError(f"{error}{hint}") from error
-    return policy, experiment
-
-
-def _chosen(experiment: Experiment, text: str | None) -> tuple[int, ...] | None:
-    """Return the index of a sentence of the task; None: all of them."""
-    if text is None:
-        return None
-    known = [sentence.lower().rstrip(".") for sentence in experiment.sentences]
-    wanted = text.lower().strip().rstrip(".")
-    if wanted not in known:
-        listed = ", ".join(map(repr, experiment.sentences))
-        raise ValueError(f"instruction: got {text!r}, available: {listed}")
-    return (known.index(wanted),)
+    wanted = None if instruction is None else [instruction]
+    return policy, experiment, choose_instructions(experiment.sentences, wanted)

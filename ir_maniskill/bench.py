@@ -6,7 +6,6 @@ takes turns in short blocks, medians are taken, and the ratio is what counts.
 
 from __future__ import annotations
 
-import json
 import os
 import statistics
 import tempfile
@@ -14,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from ir_maniskill.checks import require
 from ir_maniskill.environment.vector import make_vec
 from ir_maniskill.evaluation.evaluate import machine, versions
 from ir_maniskill.training.config import CONFIGS, TrainConfig
@@ -101,18 +102,17 @@ def run(seconds: float = 10.0, quick: bool = False) -> Report:
         quick: Whether to measure as briefly as possible, without the peer, which takes
             long to load.
     """
+    require(0 < seconds <= 600, "seconds", seconds, "up to 600")
     seconds = 1.0 if quick else seconds
-    jobs: tuple[Callable[[], Iterator[Row]], ...] = (
-        lambda: one_env("state", seconds, peer=not quick),
-        lambda: one_env("rgb", seconds, peer=not quick),
-        lambda: many_envs(seconds),
-        lambda: training(updates=1 if quick else 3),
+    jobs = (
+        one_env("state", seconds, peer=not quick),
+        one_env("rgb", seconds, peer=not quick),
+        many_envs(seconds),
+        training(updates=1 if quick else 3),
     )
-    rows: list[Row] = []
-    for job in tqdm(jobs, desc="bench"):
-        rows += job()
+    rows = tuple(chain.from_iterable(tqdm(jobs, desc="bench")))
     facts = {**machine(), "load": round(os.getloadavg()[0], 1), **versions()}
-    return Report(facts, tuple(rows))
+    return Report(facts, rows)
 
 
 def one_env(obs_mode: str, seconds: float, peer: bool) -> Iterator[Row]:
@@ -150,20 +150,12 @@ def many_envs(seconds: float) -> Iterator[Row]:
 def training(updates: int, config: TrainConfig = CONFIGS["default"]) -> Iterator[Row]:
     """Compare training with collecting alone, by the times that a run logs."""
     with tempfile.TemporaryDirectory() as folder:
-        config = replace(
-            config,
-            env_id=OURS,
-            out=folder,
-            total_steps=updates * config.steps_per_update,
-            eval_episodes=3,
-        )
-        train(config)
+        steps = config.steps_per_update
+        brief: dict[str, Any] = {"total_steps": updates * steps, "eval_episodes": 3}
+        train(replace(config, env_id=OURS, out=folder, **brief))
         rows = list(whole_rows(Path(folder) / "metrics.csv"))
-    collect, update = (
-        [float(row[f"time/{name}"]) for row in rows] for name in ("collect", "update")
-    )
-    both = [sum(pair) for pair in zip(collect, update, strict=True)]
-    steps = config.steps_per_update
+    collect = [float(row["time/collect"]) for row in rows]
+    both = [float(row["time/collect"]) + float(row["time/update"]) for row in rows]
     speed, alone = (steps / statistics.median(times) for times in (both, collect))
     yield Row("training, preset `default`", speed, "its envs and actions alone", alone)
 
@@ -202,14 +194,9 @@ def timed(work: Callable[[], Any], steps: int) -> float:
 def make(task: str, obs_mode: str) -> Any:
     """Make one env on the CPU and step it once, which compiles its shaders."""
     cameras = {"width": SIDE, "height": SIDE, "shader_pack": SHADER}
-    env = gym.make(
-        task,
-        obs_mode=obs_mode,
-        num_envs=1,
-        sim_backend="physx_cpu",
-        render_backend="cpu",
-        sensor_configs=cameras if obs_mode == "rgb" else {},
-    )
+    kwargs: dict[str, Any] = {"sim_backend": "physx_cpu", "render_backend": "cpu"}
+    kwargs["sensor_configs"] = cameras if obs_mode == "rgb" else {}
+    env = gym.make(task, obs_mode=obs_mode, **kwargs)
     env.reset(seed=0)
     env.step(actions(env, 1)[0])
     return env
@@ -217,11 +204,9 @@ def make(task: str, obs_mode: str) -> Any:
 
 def make_many(num_envs: int, workers: int) -> Any:
     """Make a vector of envs with small pictures."""
-    cameras = {"width": 32, "height": 64, "shader_pack": SHADER}
-    kwargs: dict[str, Any] = {"obs_mode": "rgb", "sensor_configs": cameras}
-    return make_vec(
-        OURS, num_envs, num_workers=workers, sim_backend="physx_cpu", **kwargs
-    )
+    kwargs: dict[str, Any] = {"obs_mode": "rgb", "sim_backend": "physx_cpu"}
+    kwargs["sensor_configs"] = {"width": 32, "height": 64, "shader_pack": SHADER}
+    return make_vec(OURS, num_envs, num_workers=workers, **kwargs)
 
 
 def actions(env: Any, steps: int) -> np.ndarray:
@@ -295,9 +280,3 @@ def stepping_many(envs: Any) -> Block:
     return lambda: timed(
         lambda: [envs.step(action) for action in plan], EPISODE * envs.num_envs
     )
-
-
-def save(report: Report, path: Path) -> None:
-    """Write the report as JSON."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(report.as_dict(), indent=2) + "\n")

@@ -8,20 +8,20 @@ import logging
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 from tyro.conf import Positional, arg, subcommand
 
-from ir_maniskill import api, doctor
+from ir_maniskill import api, bench, doctor
 from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.robots.robot import Robot, available_robots, short_name
-from ir_maniskill.evaluation import plots, video
+from ir_maniskill.evaluation import plots
 from ir_maniskill.evaluation.evaluate import EVALUATION_SEED, write_report
 from ir_maniskill.experiment import Experiment
-from ir_maniskill.files import require_writable
+from ir_maniskill.files import require_writable, write_json
 from ir_maniskill.policy import load_policy, shipped
 from ir_maniskill.training import distributed
 from ir_maniskill.training.config import (
@@ -47,6 +47,15 @@ class UsageError(ValueError):
 class Tasks:
     """List the tasks, and the robots that can do them."""
 
+    def run(self) -> None:
+        """Print both tables."""
+        rows = [("ID", "SENTENCES", "OBJECTS", "REWARD", "SENSES")]
+        rows += [_describe(catalog.get(name)) for name in catalog.available()]
+        _print_table(rows)
+        rows = [("ROBOT", "UID", "ACTIONS", "HANDS AND FINGERS", "SCALE")]
+        rows += [_describe_robot(robot) for robot in available_robots().values()]
+        _print_table(rows)
+
 
 @dataclasses.dataclass(frozen=True)
 class TrainOptions(TrainConfig):
@@ -68,10 +77,27 @@ class Train:
     resume: bool = False
     """Go on from the folder's last checkpoint, if there is one, with its own config."""
 
+    def train_config(self) -> TrainConfig:
+        """Return the configuration that is asked for."""
+        task = catalog.get(self.config.env_id).id
+        out = self.config.out or f"runs/{task}"
+        return TrainConfig(**{**vars(self.config), "env_id": task, "out": out})
+
+    def run(self) -> None:
+        """Train, in this process or as one of torchrun's."""
+        config = self.train_config()
+        with distributed.group():
+            best = train(config, resume=self.resume)
+            if distributed.rank() == 0:
+                print(f"The best policy is in {best}.")
+                print(
+                    f"Next: ir-maniskill evaluate {config.env_id} --checkpoint {best}"
+                )
+
 
 @dataclasses.dataclass(frozen=True)
-class Evaluate:
-    """Evaluate a policy: success, exclusive success and touch, per instruction."""
+class _Play:
+    """What commands share that play a policy."""
 
     env_id: TaskId
     """Task, e.g. NaoTouchCubeSingle-v1; MODULE is imported first."""
@@ -79,10 +105,35 @@ class Evaluate:
     """Policy or checkpoint file; None: the one that ships with the package."""
     any_task: bool = False
     """Accept a policy that was trained for another task."""
-    episodes: int = 100
-    """Episodes, spread evenly over the instructions."""
     seed: int = EVALUATION_SEED
     """Seed of the first episode; episode e starts from seed + e."""
+    instruction: str | None = None
+    """Play this sentence only; None: all of the task's."""
+
+    def policy_file(self) -> Path:
+        """Return the file of the policy: the one given, or the shipped one."""
+        task = catalog.get(self.env_id).id
+        path = self.checkpoint or shipped(task)
+        if self.checkpoint is None and not path.is_file():
+            raise UsageError(
+                f"no policy for {task}: none was given and none ships with the package "
+                f"(looked for {path}). Train one: ir-maniskill train {task}; then "
+                f"add --checkpoint runs/{task}/best.safetensors"
+            )
+        return path
+
+    def options(self, *more: str) -> dict[str, Any]:
+        """Return the arguments that go to `api` as they are."""
+        names = ("any_task", "seed", "instruction", *more)
+        return {name: getattr(self, name) for name in names}
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluate(_Play):
+    """Evaluate a policy: success, exclusive success and touch, per instruction."""
+
+    episodes: int = 100
+    """Episodes, spread evenly over the instructions."""
     num_envs: int = 8
     """Scenes simulated side by side; on a CPU the result is the same for any number."""
     sim_backend: SimBackend = "physx_cpu"
@@ -91,40 +142,60 @@ class Evaluate:
     """What draws, as for `train`."""
     json: Path | None = None
     """File to write the report to."""
-    instruction: str | None = None
-    """Evaluate this sentence only; None: all of the task's."""
+
+    def run(self) -> None:
+        """Print the report, and write it."""
+        policy = load_policy(self.policy_file())
+        if self.json is not None:
+            require_writable(self.json)
+        task = catalog.get(self.env_id).id
+        more = ("episodes", "num_envs", "sim_backend", "render_backend")
+        report = api.evaluate(policy, task, **self.options(*more))
+        print(report)
+        if self.json is not None:
+            write_report(
+                self.json,
+                report,
+                reward_mode=policy.env_kwargs["reward_mode"],
+                checkpoint=str(self.checkpoint or task),
+                trained_steps=policy.metadata.get("steps"),
+                config=dataclasses.asdict(policy.config),
+            )
 
 
 @dataclasses.dataclass(frozen=True)
-class Video:
+class Video(_Play):
     """Make a video of a policy (.mp4, or .gif)."""
 
-    env_id: TaskId
-    """Task, e.g. NaoTouchCubeSingle-v1; MODULE is imported first."""
-    checkpoint: Path | None = None
-    """Policy or checkpoint file; None: the one that ships with the package."""
-    any_task: bool = False
-    """Accept a policy that was trained for another task."""
     out: Path | None = None
     """File to write; None: runs/ID.mp4."""
     episodes: int = 3
     """Episodes; the instructions take turns."""
-    seed: int = EVALUATION_SEED
-    """Seed of the first episode; episode e starts from seed + e."""
     speed: float = 0.5
     """How fast to play; 1 is real time."""
-    instruction: str | None = None
-    """Show this sentence only; None: all of the task's."""
+
+    def run(self) -> None:
+        """Film the policy."""
+        task = catalog.get(self.env_id).id
+        out = self.out or Path("runs") / f"{task}.mp4"
+        options = self.options("episodes", "speed")
+        api.record(self.policy_file(), out, task, **options)
+        print(f"The video is in {out}.")
 
 
 @dataclasses.dataclass(frozen=True)
 class Curve:
     """Draw the learning curve of a run (.png)."""
 
-    run: Positional[Annotated[Path, arg(metavar="FOLDER")]]
+    folder: Positional[Annotated[Path, arg(metavar="FOLDER")]]
     """Folder of the run."""
     out: Path | None = None
     """File to write; None: learning_curve.png in that folder."""
+
+    def run(self) -> None:
+        """Draw it."""
+        out = plots.learning_curve(self.folder, self.out)
+        print(f"The learning curve is in {out}.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,10 +209,23 @@ class Bench:
     quick: bool = False
     """Measure as briefly as possible, and without ManiSkill's humanoid task."""
 
+    def run(self) -> None:
+        """Print the table, and write it."""
+        if self.json is not None:
+            require_writable(self.json)
+        report = bench.run(self.seconds, self.quick)
+        print(report)
+        if self.json is not None:
+            write_json(self.json, report.as_dict())
+
 
 @dataclasses.dataclass(frozen=True)
 class Doctor:
     """Say whether this machine can render, and what to install if not."""
+
+    def run(self) -> int:
+        """Print the diagnosis and return the exit code."""
+        return doctor.main([])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -162,7 +246,7 @@ def run(arguments: Sequence[str]) -> int:
     """Carry out one command and return its exit code."""
     try:
         command = parse(arguments)
-        return _COMMANDS[type(command)](command)
+        return command.run() or 0
     except KeyboardInterrupt:
         return 130
     except (ValueError, RuntimeError, OSError, catalog.UnknownExperimentError) as error:
@@ -193,7 +277,7 @@ def parse(arguments: Sequence[str]) -> Any:
     command = _parse(arguments, CONFIGS[preset or "default"])
     if not isinstance(command, Train) or not command.resume:
         return command
-    config = _config(command)
+    config = command.train_config()
     stored = stored_config(Path(config.out))
     if stored is None:
         return command
@@ -205,42 +289,24 @@ def parse(arguments: Sequence[str]) -> Any:
 
 def _parse(arguments: Sequence[str], defaults: TrainConfig) -> Any:
     """Return the command, with defaults for what `train` is not told."""
-    numbers = {f.name: getattr(defaults, f.name) for f in _TRAIN_FIELDS}
-    options = TrainOptions(**{**numbers, "env_id": tyro.MISSING, "out": ""})
+    numbers = {**vars(defaults), "env_id": tyro.MISSING, "out": ""}
+    default = Train(TrainOptions(**numbers))
     commands = (
-        Annotated[Tasks, subcommand("tasks")]
-        | Annotated[Train, subcommand("train", default=Train(options))]
-        | Annotated[Evaluate, subcommand("evaluate")]
-        | Annotated[Video, subcommand("video")]
-        | Annotated[Curve, subcommand("curve")]
-        | Annotated[Bench, subcommand("bench")]
-        | Annotated[Doctor, subcommand("doctor")]
+        Tasks
+        | Annotated[Train, subcommand("train", default=default)]
+        | Evaluate
+        | Video
+        | Curve
+        | Bench
+        | Doctor
     )
+    description = "InstructRobot: a robot learns to do what a sentence says."
     return tyro.cli(
-        commands, args=list(arguments), prog="ir-maniskill", description=_DESCRIPTION
+        commands, args=list(arguments), prog="ir-maniskill", description=description
     )
 
 
-def _config(command: Train) -> TrainConfig:
-    """Return the configuration that a train command asks for."""
-    options = command.config
-    numbers = {f.name: getattr(options, f.name) for f in _TRAIN_FIELDS}
-    numbers["env_id"] = catalog.get(options.env_id).id
-    numbers["out"] = options.out or f"runs/{numbers['env_id']}"
-    return TrainConfig(**numbers)
-
-
-# -- Commands ------------------------------------------------------------------------
-
-
-def _tasks(_: Tasks) -> int:
-    rows = [("ID", "SENTENCES", "OBJECTS", "REWARD", "SENSES")]
-    rows += [_describe(catalog.get(name)) for name in catalog.available()]
-    _print_table(rows)
-    rows = [("ROBOT", "UID", "ACTIONS", "HANDS AND FINGERS", "SCALE")]
-    rows += [_describe_robot(robot) for robot in available_robots().values()]
-    _print_table(rows)
-    return 0
+# -- Tables --------------------------------------------------------------------------
 
 
 def _print_table(rows: Sequence[tuple[str, ...]]) -> None:
@@ -274,132 +340,6 @@ def _describe(experiment: Experiment) -> tuple[str, str, str, str, str]:
         reward[experiment.reward] + penalty,
         ", ".join(experiment.senses),
     )
-
-
-def _train(command: Train) -> int:
-    config = _config(command)
-    with distributed.group():
-        best = train(config, resume=command.resume)
-        if distributed.rank() == 0:
-            print(f"The best policy is in {best}.")
-            print(f"Next: ir-maniskill evaluate {config.env_id} --checkpoint {best}")
-    return 0
-
-
-def _evaluate(command: Evaluate) -> int:
-    task = catalog.get(command.env_id)
-    _require("num-envs", command.num_envs, least=1)
-    _require("episodes", command.episodes, least=1)
-    _require("seed", command.seed, least=0)
-    policy = load_policy(_find_policy(task, command.checkpoint))
-    if command.json is not None:
-        require_writable(command.json)
-    report = api.evaluate(
-        policy,
-        task.id,
-        episodes=command.episodes,
-        seed=command.seed,
-        num_envs=command.num_envs,
-        instruction=command.instruction,
-        any_task=command.any_task,
-        sim_backend=command.sim_backend,
-        render_backend=command.render_backend,
-    )
-    print(report)
-    if command.json is not None:
-        write_report(
-            command.json,
-            report,
-            reward_mode=policy.env_kwargs["reward_mode"],
-            checkpoint=str(command.checkpoint or task.id),
-            trained_steps=policy.metadata.get("steps"),
-            config=dataclasses.asdict(policy.config),
-        )
-    return 0
-
-
-def _video(command: Video) -> int:
-    task = catalog.get(command.env_id)
-    _require("seed", command.seed, least=0)
-    path = _find_policy(task, command.checkpoint)
-    out = command.out or Path("runs") / f"{task.id}.mp4"
-    video.check_name(out)
-    require_writable(out)
-    api.record(
-        path,
-        out,
-        task.id,
-        episodes=command.episodes,
-        seed=command.seed,
-        speed=command.speed,
-        instruction=command.instruction,
-        any_task=command.any_task,
-    )
-    print(f"The video is in {out}.")
-    return 0
-
-
-def _curve(command: Curve) -> int:
-    out = plots.learning_curve(command.run, command.out)
-    print(f"The learning curve is in {out}.")
-    return 0
-
-
-def _bench(command: Bench) -> int:
-    if not 0 < command.seconds <= 600:
-        raise UsageError(f"--seconds: got {command.seconds:g}, expected up to 600")
-    from ir_maniskill import bench  # it loads much that others don't need
-
-    if command.json is not None:
-        require_writable(command.json)
-    report = bench.run(command.seconds, command.quick)
-    print(report)
-    if command.json is not None:
-        bench.save(report, command.json)
-    return 0
-
-
-def _doctor(_: Doctor) -> int:
-    return doctor.main([])
-
-
-# -- What the commands share ---------------------------------------------------------
-
-
-def _find_policy(task: Experiment, given: Path | None) -> Path:
-    """Return the policy file to use: the one given, or the shipped one."""
-    if given is not None:
-        if not given.is_file():
-            raise UsageError(f"--checkpoint: got {given}, expected an existing file")
-        return given
-    path = shipped(task.id)
-    if not path.is_file():
-        raise UsageError(
-            f"no policy for {task.id}: none was given and none ships with the package "
-            f"(looked for {path}). Train one: ir-maniskill train {task.id}; then "
-            f"add --checkpoint runs/{task.id}/best.safetensors"
-        )
-    return path
-
-
-def _require(name: str, value: int, least: int) -> None:
-    if value < least:
-        raise UsageError(f"--{name}: got {value}, expected at least {least}")
-
-
-_DESCRIPTION = "InstructRobot: a robot learns to do what a sentence says."
-
-_TRAIN_FIELDS = dataclasses.fields(TrainConfig)
-
-_COMMANDS: dict[type, Callable[[Any], int]] = {
-    Tasks: _tasks,
-    Train: _train,
-    Evaluate: _evaluate,
-    Video: _video,
-    Curve: _curve,
-    Bench: _bench,
-    Doctor: _doctor,
-}
 
 
 if __name__ == "__main__":

@@ -119,11 +119,9 @@ def diagnose() -> Diagnosis:
 
     A broken driver can end the process that asks it for a picture, hence the process.
     """
-    probe = _run_probe()
-    error = probe.get("error")
-    if error is None and not probe.get("drawn"):
-        error = "the test picture came out blank"
-    release = os_release()
+    probe, release = _run_probe(), os_release()
+    blank = None if probe.get("drawn") else "the test picture came out blank"
+    error = probe.get("error", blank)
     physx = any(Path.home().glob(".sapien/physx/*/libPhysXGpu_64.so"))
     facts = {
         "Python": platform.python_version(),

@@ -18,14 +18,12 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.utils.rnn import pad_sequence
 
-from ir_maniskill import experiment as catalog
-from ir_maniskill.environment.senses import State
+from ir_maniskill.environment.senses import State, tokens_of
 from ir_maniskill.environment.vector import make_vec
 from ir_maniskill.evaluation.evaluate import EVALUATION_SEED, evaluate_policy
-from ir_maniskill.experiment import Experiment, tokenize
-from ir_maniskill.training.checkpoint import load_policy
+from ir_maniskill.experiment import Experiment
+from ir_maniskill.policy import load_policy
 
 ROOT = Path(__file__).parent.parent
 OUT = ROOT / "docs" / "results" / "controls.json"
@@ -62,13 +60,6 @@ def retold(tokens: Tensor, instead: list[int]) -> Change:
     return change
 
 
-def tokens_of(experiment: Experiment) -> Tensor:
-    """Return all sentences of a task as the env gives them [I, L]."""
-    words = experiment.vocabulary
-    rows = [torch.tensor(tokenize(s, words)) for s in experiment.sentences]
-    return pad_sequence(rows, batch_first=True)
-
-
 def controls(experiment: Experiment) -> dict[str, Change]:
     """Return the controls by name; those of the sentence need several sentences."""
     changes = {
@@ -79,7 +70,7 @@ def controls(experiment: Experiment) -> dict[str, Change]:
     }
     count = len(experiment.sentences)
     if count > 1:
-        tokens = tokens_of(experiment)
+        tokens = tokens_of(experiment.sentences, experiment.vocabulary)
         shifted = [(index + 1) % count for index in range(count)]
         changes["the sentence of another object"] = retold(tokens, shifted)
         changes["always the first sentence"] = retold(tokens, [0] * count)
@@ -93,23 +84,19 @@ def measure(path: Path, episodes: int) -> tuple[str, dict[str, Any]]:
         path: Policy or checkpoint file.
         episodes: Episodes of each control, spread evenly over the sentences.
     """
-    agent, config, facts = load_policy(path)
-    play: dict[str, Any] = {"seed": EVALUATION_SEED, "frames": config.frames}
-    figures = {}
-    with closing(
-        make_vec(config.env_id, 8, **config.env_kwargs(training=False))
-    ) as envs:
-        for name, change in controls(catalog.get(config.env_id)).items():
+    policy, figures = load_policy(path), {}
+    with closing(make_vec(policy.env_id, 8, **policy.env_kwargs)) as envs:
+        for name, change in controls(envs.experiment).items():
             report = evaluate_policy(
-                lambda state, change=change: agent.policy(change(state)),
-                config.env_id,
+                lambda state, change=change: policy.agent.policy(change(state)),
+                envs,
                 episodes=episodes,
-                envs=envs,
+                seed=EVALUATION_SEED,
+                frames=policy.config.frames,
                 progress=True,
-                **play,
             )
             figures[name] = report.overall.as_dict()
-    return config.env_id, {"steps": facts.get("steps"), "controls": figures}
+    return policy.env_id, {"steps": policy.metadata.get("steps"), "controls": figures}
 
 
 if __name__ == "__main__":

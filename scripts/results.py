@@ -72,7 +72,7 @@ class Run:
 def take_in(folder: Path, label: str) -> Run:
     """Return what is to be kept of a finished run."""
     config = json.loads((folder / "config.json").read_text())
-    updates = list(whole_rows(folder / "metrics.csv"))
+    updates = whole_rows(folder / "metrics.csv")
     seconds = sum(float(r["time/collect"]) + float(r["time/update"]) for r in updates)
     return Run(
         name=folder.resolve().name,

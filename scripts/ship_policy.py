@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import subprocess
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 from ir_maniskill import experiment as catalog
+from ir_maniskill.environment.vector import make_vec
 from ir_maniskill.evaluation.evaluate import (
     EVALUATION_SEED,
     EvaluationReport,
     evaluate_policy,
     evaluate_scenes,
 )
+from ir_maniskill.files import write_json
 from ir_maniskill.training import checkpoint
 
 FOLDER = Path(__file__).parent.parent / "assets" / "policies"
@@ -35,18 +37,16 @@ def ship(run: Path, episodes: int, scenes: int) -> EvaluationReport:
     """
     stored = checkpoint.read(run / "best.safetensors")
     agent, config, facts = checkpoint.load_policy(run / "best.safetensors")
-    play: dict[str, Any] = {
-        "seed": EVALUATION_SEED,
-        "frames": config.frames,
-        "env_kwargs": config.env_kwargs(training=False),
-        "progress": True,
-    }
     task, sentences = config.env_id, len(catalog.get(config.env_id).sentences)
-    report = evaluate_policy(agent.policy, task, episodes=episodes * sentences, **play)
-    figures = {**report.as_dict(), "commit": _commit()}
-    if sentences > 1:
-        same = evaluate_scenes(agent.policy, task, scenes=scenes, **play)
-        figures["same_scene"] = same.as_dict()
+    play: dict[str, Any] = {"frames": config.frames, "progress": True}
+    play["seed"] = EVALUATION_SEED
+    with closing(make_vec(task, 8, **config.env_kwargs(training=False))) as envs:
+        told = episodes * sentences
+        report = evaluate_policy(agent.policy, envs, episodes=told, **play)
+        figures = {**report.as_dict(), "commit": _commit()}
+        if sentences > 1:
+            same = evaluate_scenes(agent.policy, envs, scenes=scenes, **play)
+            figures["same_scene"] = {"scenes": scenes, **same.as_dict("exclusive")}
     # Only now: what shipped before stays until the new figures are there.
     path = FOLDER / f"{task}.safetensors"
     path.parent.mkdir(exist_ok=True)
@@ -54,8 +54,7 @@ def ship(run: Path, episodes: int, scenes: int) -> EvaluationReport:
     checkpoint.write(path, dataclasses.replace(stored, metadata=metadata))
     origin = {"run": run.resolve().name, "steps": facts["steps"]}
     origin["training_seed"] = config.seed
-    text = json.dumps({**origin, **figures}, indent=2)
-    path.with_suffix(".json").write_text(text + "\n")
+    write_json(path.with_suffix(".json"), {**origin, **figures})
     return report
 
 

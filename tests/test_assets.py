@@ -243,9 +243,9 @@ def test_meshes_are_cheap_and_one_draw_call_each(model):
 @pytest.mark.parametrize(
     ("surface", "joint"),
     [
-        (parts.drum(), "LShoulderPitch"),
-        (parts.elbow(), "LElbowYaw"),
-        (parts.forearm(), "LWristYaw"),
+        (parts.shell("drum"), "LShoulderPitch"),
+        (parts.shell("elbow"), "LElbowYaw"),
+        (parts.shell("forearm"), "LWristYaw"),
     ],
 )
 def test_what_a_neighbor_link_carries_is_round_about_the_joint(surface, joint):

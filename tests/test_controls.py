@@ -4,10 +4,11 @@ import controls
 import pytest
 import torch
 
+from ir_maniskill.environment.senses import tokens_of
 from ir_maniskill.experiment import get
 
 TASK = get("NaoTouchCubeTriangle-v1")
-TOKENS = controls.tokens_of(TASK)
+TOKENS = tokens_of(TASK.sentences, TASK.vocabulary)
 
 
 def state(told=0):

@@ -117,7 +117,10 @@ def test_a_checkpoint_is_played_on_the_task_that_is_named(
     main = runpy.run_path(script("evaluate_and_record.py"))["main"]
     played = []
     fakes = {"load_policy": lambda path: (SimpleNamespace(policy=None), MULTI, {})}
-    fakes["evaluate_policy"] = lambda policy, task, **_: played.append(task)
+    fakes["make_vec"] = lambda task, *_, **__: SimpleNamespace(
+        task=task, close=lambda: None
+    )
+    fakes["evaluate_policy"] = lambda policy, envs, **_: played.append(envs.task)
     for name in ("write_report", "record", "write_video"):
         fakes[name] = lambda *_, **__: None
     for name, fake in fakes.items():

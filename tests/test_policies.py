@@ -1,5 +1,6 @@
 """The shipped policies load, say how good they are, and are."""
 
+from contextlib import closing
 from importlib.resources import files
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import torch
 from policy_states import fixed_states
 from torch import Tensor
 
+from ir_maniskill import make_vec
 from ir_maniskill.evaluation.evaluate import Policy, Score, evaluate_policy
 from ir_maniskill.training.checkpoint import load_policy
 from ir_maniskill.training.config import TrainConfig
@@ -18,15 +20,12 @@ SHIPPED = sorted(Path(str(files("ir_maniskill.assets"))).glob("policies/*.safete
 
 def play(policy: Policy, config: TrainConfig, episodes: int) -> Score:
     """Return how the policy does on scenes that nothing was chosen by."""
-    return evaluate_policy(
-        policy,
-        config.env_id,
-        episodes=episodes,
-        seed=3_000_000,
-        num_envs=2,
-        frames=config.frames,
-        env_kwargs=config.env_kwargs(training=False),
-    ).overall
+    with closing(
+        make_vec(config.env_id, 2, **config.env_kwargs(training=False))
+    ) as envs:
+        return evaluate_policy(
+            policy, envs, episodes=episodes, seed=3_000_000, frames=config.frames
+        ).overall
 
 
 def test_there_are_shipped_policies() -> None:

@@ -9,7 +9,7 @@ import ship_policy
 from toy_envs import SPEC, toy_config, toy_state
 
 from ir_maniskill.agent import Agent
-from ir_maniskill.evaluation.evaluate import Rate, SceneReport
+from ir_maniskill.evaluation.evaluate import Rate
 from ir_maniskill.training import checkpoint
 
 TASK = {1: "NaoTouchCubeSingle-v1", 3: "NaoTouchCubeShuffled-v1"}
@@ -18,14 +18,20 @@ TASK = {1: "NaoTouchCubeSingle-v1", 3: "NaoTouchCubeShuffled-v1"}
 STATE = toy_state(20)
 
 
-def fake_report(policy, env_id, *, episodes, **_):
-    acts = policy(STATE).tolist()
-    figures = {"env_id": env_id, "episodes": episodes, "acts": acts}
+def fake_report(policy, envs, *, episodes, **_):
+    figures = {"episodes": episodes, "acts": policy(STATE).tolist()}
     return SimpleNamespace(as_dict=lambda: figures)
 
 
-def fake_scenes(policy, env_id, *, scenes, seed, **_):
-    return SceneReport(env_id, seed, Rate(scenes - 1, scenes), {})
+def fake_scenes(policy, envs, *, scenes, **_):
+    return Rate(scenes - 1, scenes)
+
+
+@pytest.fixture(autouse=True)
+def no_envs(monkeypatch):
+    """Nothing is simulated."""
+    none = SimpleNamespace(close=lambda: None)
+    monkeypatch.setattr(ship_policy, "make_vec", lambda *_, **__: none)
 
 
 def make_run(folder, task):

@@ -225,9 +225,7 @@ def test_the_video_shows_the_evaluated_episode(multi_vec, reflex, env_kwargs):
             env_kwargs=env_kwargs,
         )
     )
-    report = evaluate_policy(
-        reflex, env_id, episodes=1, seed=seed, instructions=[1], envs=multi_vec
-    )
+    report = evaluate_policy(reflex, multi_vec, episodes=1, seed=seed, instructions=[1])
     assert [shot.step for shot in shots] == list(range(33))
     assert {shot.instruction for shot in shots} == {"Touch the red cube."}
     assert shots[-1].score == pytest.approx(report.overall.mean_return)

@@ -5,79 +5,58 @@ else is merged, in the posture of `facts/posture.csv`, into the link `torso`.
 """
 
 import argparse
-import math
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from . import facts
-from .facts import Actuation, Frames, Inertial, Row
+from .facts import Frames, Inertial, Row
 from .parts import PALETTE, parts
 from .shapes import bake
 
 FOLDER = Path(__file__).parent
 ROOT = "torso"
 
-PHALANX_MASS = 0.004
-"""Mass of every finger link [kg]; the public description has none worth the name."""
-PHALANX_RADIUS = 0.0055
-"""Radius of a phalanx [m]."""
-PHALANX_SHAFT = 0.010
-"""Length of the straight part of a phalanx [m]."""
-PHALANX_PITCH = 0.01436
-"""Distance between the joints of a finger [m]."""
-PHALANX_LEAST_INERTIA = 1e-7
-"""Least principal inertia of a finger link, for a stable simulation [kg m^2]."""
+# A solid capsule of 4 g along x, 5.5 mm in radius with a shaft of 10 mm; its least
+# inertia is raised for a stable simulation. The public description has no mass here
+# worth the name.
+PHALANX = Inertial(
+    0.004, np.array([0.00718, 0, 0]), np.diag([1e-7, 1.34371e-7, 1.34371e-7])
+)
+"""Mass properties of every finger link."""
 
 _Vector = tuple[float, float, float]
+Shape = tuple[_Vector, _Vector | float]
+"""Middle of a collision shape, and the edges of a box or the radius of a ball [m]."""
 
-
-@dataclass(frozen=True)
-class Box:
-    """A collision box along the axes of its link."""
-
-    center: _Vector
-    """Middle [m]."""
-    size: _Vector
-    """Edge lengths [m]."""
-
-
-@dataclass(frozen=True)
-class Ball:
-    """A collision sphere."""
-
-    center: _Vector
-    """Middle [m]."""
-    radius: float
-    """Radius [m]."""
-
-
-Shape = Box | Ball
-
-# Two balls a phalanx stand for its capsule: URDF has no capsule that every parser
-# reads, and evenly spaced along the finger they leave dents of 1.3 mm only.
-_PHALANX_SHAPES = tuple(
-    Ball((PHALANX_PITCH * share, 0, 0), PHALANX_RADIUS) for share in (0.25, 0.75)
-)
+_FINGERTIPS = ("Finger13_link", "Finger23_link", "Thumb2_link")
 
 # The links between have no look of their own: shoulder, elbow and forearm are round
 # about a joint's axis, so that the link on its other side can carry their surface.
-_ARM_MESHES = {"Bicep": "bicep", "_wrist": "hand"}
-
-_FINGERTIPS = ("Finger13_link", "Finger23_link", "Thumb2_link")
+_MESHES = {
+    ROOT: "torso",
+    "LBicep": "l_bicep",
+    "RBicep": "r_bicep",
+    "l_wrist": "l_hand",
+    "r_wrist": "r_hand",
+}
 
 # Shoulders and elbows need none: they are never the first to touch anything.
 _COLLISIONS: dict[str, tuple[Shape, ...]] = {
     ROOT: (
-        Box((0.0, 0.0, 0.0), (0.090, 0.120, 0.220)),
-        Ball((0.0, 0.0, 0.180), 0.060),
+        ((0.0, 0.0, 0.0), (0.090, 0.120, 0.220)),
+        ((0.0, 0.0, 0.180), 0.060),
     ),
-    "Bicep": (Box((0.025, 0.009, 0.0), (0.070, 0.044, 0.044)),),
-    "ForeArm": (Box((0.030, 0.001, 0.0), (0.046, 0.042, 0.042)),),
-    "_wrist": (Box((0.037, 0.0, -0.001), (0.058, 0.046, 0.042)),),
+    "Bicep": (((0.025, 0.009, 0.0), (0.070, 0.044, 0.044)),),
+    "ForeArm": (((0.030, 0.001, 0.0), (0.046, 0.042, 0.042)),),
+    "_wrist": (((0.037, 0.0, -0.001), (0.058, 0.046, 0.042)),),
+    # Two balls stand for a phalanx: URDF has no capsule that every parser reads, and
+    # evenly spaced along the finger they leave dents of 1.3 mm only.
+    "phalanx": (((0.00359, 0, 0), 0.0055), ((0.01077, 0, 0), 0.0055)),
 }
 
 
@@ -109,47 +88,32 @@ def posture_frames() -> Frames:
 
 def urdf() -> str:
     """Return the text of the URDF."""
-    joints, driven = facts.read_joints(), facts.read_actuation()
-    inertials = link_inertials(joints, driven)
-    robot = ET.Element("robot", name="nao")
-    robot.append(ET.Comment(" Written by build.py: change that, not this. "))
-    for link, inertial in inertials.items():
-        robot.append(_link(link, inertial))
-    for name, actuation in driven.items():
-        robot.append(_joint(joints[name], actuation))
+    joints, driven = facts.read_joints(), facts.read("actuation")
+    moving = [joints[row["joint"]]["child_link"] for row in driven]
+    robot = _node(
+        "robot",
+        ET.Comment(" Written by build.py: change that, not this. "),
+        *(_link(name, inertial) for name, inertial in link_inertials(moving).items()),
+        *(_joint(joints[row["joint"]], row) for row in driven),
+        name="nao",
+    )
     ET.indent(robot)
     return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
 
 
-def link_inertials(
-    joints: Mapping[str, Row], driven: Mapping[str, Actuation]
-) -> dict[str, Inertial]:
-    """Return the mass properties of the model's links, root first."""
-    table = facts.read_inertials()
-    moving = [joints[name]["child_link"] for name in driven]
-    inertials = {ROOT: merged_inertial(table, moving)}
-    for link in moving:
-        inertials[link] = phalanx_inertial() if _is_finger(link) else table[link]
-    return inertials
+def link_inertials(moving: list[str]) -> dict[str, Inertial]:
+    """Return the mass properties of the model's links, root first.
 
-
-def merged_inertial(table: Mapping[str, Inertial], moving: list[str]) -> Inertial:
-    """Return all that never moves, sensor frames aside, as one body of the torso."""
-    frames = posture_frames()
-    return facts.lump(
+    All that never moves, sensor frames aside, is one body of the torso.
+    """
+    table, frames = facts.read_inertials(), posture_frames()
+    fixed = facts.lump(
         body.moved(frames[link])
         for link, body in table.items()
         if link not in moving and body.mass > facts.NEGLIGIBLE_MASS
     )
-
-
-def phalanx_inertial() -> Inertial:
-    """Return the mass properties of a finger link."""
-    solid = facts.capsule_inertial(
-        PHALANX_MASS, PHALANX_RADIUS, PHALANX_SHAFT, PHALANX_PITCH / 2
-    )
-    inertia = np.maximum(solid.inertia, PHALANX_LEAST_INERTIA * np.eye(3))
-    return Inertial(solid.mass, solid.com, inertia)
+    links = {link: PHALANX if _is_finger(link) else table[link] for link in moving}
+    return {ROOT: fixed, **links}
 
 
 def _is_finger(link: str) -> bool:
@@ -157,90 +121,78 @@ def _is_finger(link: str) -> bool:
 
 
 def _mesh_of(link: str) -> str | None:
-    if link == ROOT:
-        return "torso"
     if _is_finger(link):
         return "fingertip" if link[1:] in _FINGERTIPS else "phalanx"
-    name = _ARM_MESHES.get(link[1:])
-    return name and f"{link[0].lower()}_{name}"
+    return _MESHES.get(link)
 
 
 def _shapes_of(link: str) -> tuple[Shape, ...]:
+    if _is_finger(link):
+        return _COLLISIONS["phalanx"]
     if link == ROOT:
         return _COLLISIONS[ROOT]
-    if _is_finger(link):
-        return _PHALANX_SHAPES
+    side = 1 if link[0] in "Ll" else -1
     shapes = _COLLISIONS.get(link[1:], ())
-    return shapes if link[0] in "Ll" else tuple(map(_mirrored, shapes))
+    return tuple(((x, side * y, z), size) for (x, y, z), size in shapes)
 
 
-def _mirrored(shape: Shape) -> Shape:
-    x, y, z = shape.center
-    return replace(shape, center=(x, -y, z))
+def _node(tag: str, *children: Any, **attributes: ArrayLike) -> ET.Element:
+    """Return an XML element with what is inside."""
+    node = ET.Element(tag, {name: _text(value) for name, value in attributes.items()})
+    node.extend(children)
+    return node
+
+
+def _text(value: ArrayLike) -> str:
+    if isinstance(value, str):
+        return value
+    # Rounded first, so that what should be zero is zero on every machine.
+    return " ".join(f"{round(x, 15) + 0.0:.6g}" for x in np.atleast_1d(value))
 
 
 def _link(name: str, inertial: Inertial) -> ET.Element:
-    link = ET.Element("link", name=name)
-    link.append(_inertial(inertial))
+    parts = [_inertial(inertial)]
     if mesh := _mesh_of(name):
-        geometry = ET.SubElement(ET.SubElement(link, "visual"), "geometry")
-        ET.SubElement(geometry, "mesh", filename=f"meshes/{mesh}.glb")
-    link.extend(_collision(shape) for shape in _shapes_of(name))
-    return link
+        geometry = _node("geometry", _node("mesh", filename=f"meshes/{mesh}.glb"))
+        parts.append(_node("visual", geometry))
+    return _node("link", *parts, *map(_collision, _shapes_of(name)), name=name)
 
 
 def _inertial(inertial: Inertial) -> ET.Element:
-    element = ET.Element("inertial")
-    ET.SubElement(element, "origin", xyz=_text(inertial.com), rpy="0 0 0")
-    ET.SubElement(element, "mass", value=_number(inertial.mass))
-    tensor = inertial.inertia
-    values = {
-        f"i{'xyz'[i]}{'xyz'[j]}": _number(tensor[i, j])
-        for i in range(3)
-        for j in range(i, 3)
-    }
-    ET.SubElement(element, "inertia", values)
-    return element
+    pairs = combinations_with_replacement(range(3), 2)
+    tensor = {f"i{'xyz'[i]}{'xyz'[j]}": inertial.inertia[i, j] for i, j in pairs}
+    return _node(
+        "inertial",
+        _node("origin", xyz=inertial.com, rpy="0 0 0"),
+        _node("mass", value=inertial.mass),
+        _node("inertia", **tensor),
+    )
 
 
 def _collision(shape: Shape) -> ET.Element:
-    element = ET.Element("collision")
-    ET.SubElement(element, "origin", xyz=_text(shape.center), rpy="0 0 0")
-    geometry = ET.SubElement(element, "geometry")
-    if isinstance(shape, Box):
-        ET.SubElement(geometry, "box", size=_text(shape.size))
-    else:
-        ET.SubElement(geometry, "sphere", radius=_number(shape.radius))
-    return element
+    center, size = shape
+    box = isinstance(size, tuple)
+    solid = _node("box", size=size) if box else _node("sphere", radius=size)
+    origin = _node("origin", xyz=center, rpy="0 0 0")
+    return _node("collision", origin, _node("geometry", solid))
 
 
-def _joint(row: Row, actuation: Actuation) -> ET.Element:
-    joint = ET.Element("joint", name=row["joint"], type="revolute")
-    ET.SubElement(joint, "parent", link=row["parent_link"])
-    ET.SubElement(joint, "child", link=row["child_link"])
+def _joint(row: Row, actuation: Row) -> ET.Element:
+    names = ("lower_deg", "upper_deg", "effort_nm", "velocity_rad_s")
+    lower, upper, effort, velocity = facts.vector(actuation, *names)
     xyz = " ".join(row[f"origin_{axis}_m"] for axis in "xyz")
     rpy = " ".join(row[f"{angle}_rad"] for angle in ("roll", "pitch", "yaw"))
-    ET.SubElement(joint, "origin", xyz=xyz, rpy=rpy)
-    axis = [float(row[f"axis_{name}"]) for name in "xyz"]
-    ET.SubElement(joint, "axis", xyz=_text(axis))
-    ET.SubElement(
-        joint,
-        "limit",
-        lower=_number(math.radians(actuation.lower_deg)),
-        upper=_number(math.radians(actuation.upper_deg)),
-        effort=_number(actuation.effort),
-        velocity=_number(actuation.velocity),
+    limits = {"lower": np.radians(lower), "upper": np.radians(upper)}
+    return _node(
+        "joint",
+        _node("parent", link=row["parent_link"]),
+        _node("child", link=row["child_link"]),
+        _node("origin", xyz=xyz, rpy=rpy),
+        _node("axis", xyz=facts.vector(row, "axis_x", "axis_y", "axis_z")),
+        _node("limit", **limits, effort=effort, velocity=velocity),
+        name=row["joint"],
+        type="revolute",
     )
-    return joint
-
-
-def _number(value: float) -> str:
-    # Rounded first, so that what should be zero is zero on every machine.
-    return f"{round(value, 15) + 0.0:.6g}"
-
-
-def _text(values: np.ndarray | list[float] | _Vector) -> str:
-    return " ".join(_number(value) for value in values)
 
 
 if __name__ == "__main__":

@@ -39,20 +39,6 @@ class Inertial:
         return Inertial(self.mass, com, rotation @ self.inertia @ rotation.T)
 
 
-@dataclass(frozen=True)
-class Actuation:
-    """What one driven joint may do."""
-
-    lower_deg: float
-    """Lower limit [deg]."""
-    upper_deg: float
-    """Upper limit [deg]."""
-    effort: float
-    """Largest torque [N m]."""
-    velocity: float
-    """Largest speed [rad/s]."""
-
-
 def read(table: str) -> list[Row]:
     """Return the rows of `facts/<table>.csv`."""
     with (FOLDER / f"{table}.csv").open(newline="") as file:
@@ -67,19 +53,6 @@ def read_joints() -> dict[str, Row]:
 def read_inertials() -> dict[str, Inertial]:
     """Return the mass properties by link name."""
     return {row["link"]: _inertial(row) for row in read("links")}
-
-
-def read_actuation() -> dict[str, Actuation]:
-    """Return the driven joints in the order of the robot's action."""
-    return {
-        row["joint"]: Actuation(
-            float(row["lower_deg"]),
-            float(row["upper_deg"]),
-            float(row["effort_nm"]),
-            float(row["velocity_rad_s"]),
-        )
-        for row in read("actuation")
-    }
 
 
 def read_posture() -> dict[str, float]:
@@ -106,47 +79,30 @@ def lump(bodies: Iterable[Inertial]) -> Inertial:
     bodies = list(bodies)
     mass = sum(body.mass for body in bodies)
     com = sum((body.mass * body.com for body in bodies), np.zeros(3)) / mass
-    inertia = sum(
-        (body.inertia + _steiner(body.mass, body.com - com) for body in bodies),
-        np.zeros((3, 3)),
-    )
+    inertia = np.zeros((3, 3))
+    for body in bodies:
+        off = body.com - com  # Steiner's theorem
+        inertia += body.inertia + body.mass * (
+            off @ off * np.eye(3) - np.outer(off, off)
+        )
     return Inertial(mass, com, inertia)
 
 
-def capsule_inertial(mass: float, radius: float, shaft: float, x: float) -> Inertial:
-    """Return a solid capsule lying along x, its center at (x, 0, 0)."""
-    density = mass / (np.pi * radius**2 * (shaft + 4 / 3 * radius))
-    rod, ball = (
-        density * np.pi * radius**2 * shaft,
-        density * 4 / 3 * np.pi * radius**3,
-    )
-    axial = rod * radius**2 / 2 + ball * 2 / 5 * radius**2
-    lateral = rod * (shaft**2 / 12 + radius**2 / 4) + ball * (
-        2 / 5 * radius**2 + shaft**2 / 4 + 3 / 8 * shaft * radius
-    )
-    return Inertial(mass, np.array([x, 0, 0]), np.diag([axial, lateral, lateral]))
+def vector(row: Row, *columns: str) -> np.ndarray:
+    """Return some columns of a row as numbers."""
+    return np.array([float(row[name]) for name in columns])
 
 
 def _inertial(row: Row) -> Inertial:
-    ixx, ixy, ixz, iyy, iyz, izz = (
-        float(row[key]) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    )
-    return Inertial(
-        float(row["mass_kg"]),
-        np.array([float(row[f"com_{axis}_m"]) for axis in "xyz"]),
-        np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]]),
-    )
+    tensor = vector(row, "ixx", "ixy", "ixz", "ixy", "iyy", "iyz", "ixz", "iyz", "izz")
+    com = vector(row, "com_x_m", "com_y_m", "com_z_m")
+    return Inertial(float(row["mass_kg"]), com, tensor.reshape(3, 3))
 
 
 def _joint_motion(row: Row, angle: float) -> np.ndarray:
-    rpy = [float(row[f"{name}_rad"]) for name in ("roll", "pitch", "yaw")]
+    rpy = vector(row, "roll_rad", "pitch_rad", "yaw_rad")
     motion = euler_matrix(*rpy, axes="sxyz")
-    motion[:3, 3] = [float(row[f"origin_{axis}_m"]) for axis in "xyz"]
+    motion[:3, 3] = vector(row, "origin_x_m", "origin_y_m", "origin_z_m")
     if row["type"] == "fixed":
         return motion
-    axis = [float(row[f"axis_{name}"]) for name in "xyz"]
-    return motion @ rotation_matrix(angle, axis)
-
-
-def _steiner(mass: float, offset: np.ndarray) -> np.ndarray:
-    return mass * (offset @ offset * np.eye(3) - np.outer(offset, offset))
+    return motion @ rotation_matrix(angle, vector(row, "axis_x", "axis_y", "axis_z"))

@@ -31,10 +31,24 @@ class Section:
     """Place along the axis of the loft [m]."""
     half: tuple[float, float]
     """Half widths a and b [m]; (0, 0) closes the loft in a point."""
+    color: int | None = None
+    """Index into the palette, of the skin up to the next section; of the last one, of
+    its flat lid, None: it is open."""
     center: tuple[float, float] = (0.0, 0.0)
     """Middle of the section in the plane of u and v [m]."""
     power: float = 2.0
     """2 is an ellipse, more is boxier."""
+
+    def points(self, count: int) -> np.ndarray:
+        """Return points around the section in (w, u, v), one where it is closed."""
+        if not any(self.half):
+            return np.array([[self.at, *self.center]])
+        angle = (np.arange(count) + 0.5) * 2 * np.pi / count
+        wave = np.stack([np.cos(angle), np.sin(angle)], -1)  # [P, 2]
+        curve = np.sign(wave) * np.abs(wave) ** (2 / self.power)
+        return np.column_stack(
+            [np.full(count, self.at), self.center + self.half * curve]
+        )
 
 
 @dataclass(frozen=True)
@@ -88,66 +102,68 @@ class Surface:
 
 def join(surfaces: Sequence[Surface]) -> Surface:
     """Return the surfaces as one, their smoothing groups kept apart."""
-    corners = [len(part.vertices) for part in surfaces]
-    groups = [part.groups.max() + 1 for part in surfaces]
-    cells = [part.cells.max() + 1 for part in surfaces]
+
+    def renumbered(name: str, counts: Sequence[int]) -> np.ndarray:
+        shifts = np.cumsum([0, *counts[:-1]])
+        arrays = [getattr(part, name) for part in surfaces]
+        return np.concatenate([i + n for i, n in zip(arrays, shifts, strict=True)])
+
     return Surface(
         np.concatenate([part.vertices for part in surfaces]),
-        _renumbered([part.faces for part in surfaces], corners),
+        renumbered("faces", [len(part.vertices) for part in surfaces]),
         np.concatenate([part.colors for part in surfaces]),
-        _renumbered([part.groups for part in surfaces], groups),
-        _renumbered([part.cells for part in surfaces], cells),
+        renumbered("groups", [part.groups.max() + 1 for part in surfaces]),
+        renumbered("cells", [part.cells.max() + 1 for part in surfaces]),
     )
 
 
 def loft(
-    axis: str,
-    colors: int | Sequence[int],
-    sections: Sequence[Section],
-    segments: int = 10,
-    caps: str = "both",
-    lid: int | None = None,
+    axis: str, points: int, sections: Sequence[Section], base: int | None = None
 ) -> Surface:
     """Return the skin over a row of cross sections.
 
     Args:
-        axis: The axis the sections are strung on, "x", "y" or "z"; u and v are the
-            two axes that follow it in the order x, y, z, x, y.
-        colors: One color, or one per span between sections.
+        axis: The axis w that the sections are strung on, "x", "y" or "z"; u and v are
+            the two that follow it in the order x, y, z, x, y.
+        points: P, points per section.
         sections: From low to high along the axis.
-        segments: Points per section.
-        caps: Which ends not closed in a point get a flat lid: "low", "high", "both"
-            or "none"; leave off what nobody can see.
-        lid: Color of the lids, else that of the span next to them.
+        base: Color of a flat lid at the low end; None: it is open, or closed.
     """
-    spans = len(sections) - 1
-    colors = [colors] * spans if isinstance(colors, int) else list(colors)
-    builder = _Builder(segments)
-    for section in sections:
-        builder.add_ring(section)
-    for span, color in enumerate(colors):
-        builder.add_span(span, color)
-    if caps in ("low", "both") and any(sections[0].half):
-        color = colors[0] if lid is None else lid
-        builder.add_lid(0, color, up=False)
-    if caps in ("high", "both") and any(sections[-1].half):
-        color = colors[-1] if lid is None else lid
-        builder.add_lid(spans, color, up=True)
-    return builder.surface("xyz".index(axis))
+    corners = [section.points(points) for section in sections]
+    starts = np.cumsum([0, *map(len, corners)])
+    # A closed section has one corner, which stands for all P.
+    rings = [
+        start + np.arange(points) % len(own)
+        for start, own in zip(starts, corners, strict=False)
+    ]
+    patches = [  # faces, color and smoothing group
+        (_skin(low, high), section.color, 0)
+        for section, (low, high) in zip(sections, pairwise(rings), strict=False)
+    ]
+    if base is not None:
+        patches.append((_lid(rings[0][::-1]), base, 1))
+    if sections[-1].color is not None:
+        patches.append((_lid(rings[-1]), sections[-1].color, 2))
+    sizes = [len(faces) for faces, _, _ in patches]
+    faces = np.concatenate([faces for faces, _, _ in patches])
+    colors = np.repeat([color for _, color, _ in patches], sizes)
+    groups = np.repeat([group for _, _, group in patches], sizes)
+    cells = np.where(groups > 0, -groups, np.arange(len(faces)) // 2)
+    real = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    _, cells = np.unique(cells[real], return_inverse=True)
+    vertices = np.roll(np.concatenate(corners), "xyz".index(axis), axis=1)
+    return Surface(vertices, faces[real], colors[real], groups[real], cells)
 
 
-def knob(
-    colors: Sequence[int], profile: Sequence[tuple[float, float]], segments: int
-) -> Surface:
-    """Return a round knob standing on the origin along +x.
+def _skin(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return two triangles between each two points of two rings, [2P, 3]."""
+    low_next, high_next = np.roll(low, -1), np.roll(high, -1)
+    return np.stack([low, low_next, high_next, low, high_next, high], -1).reshape(-1, 3)
 
-    Args:
-        colors: One per span of the profile, and one for the lid.
-        profile: (height, radius) pairs [m] from the foot up; the foot stays open.
-        segments: Points per ring.
-    """
-    rings = [Section(height, (radius, radius)) for height, radius in profile]
-    return loft("x", colors[:-1], rings, segments, caps="high", lid=colors[-1])
+
+def _lid(ring: np.ndarray) -> np.ndarray:
+    """Return the triangles of a flat lid, counterclockwise as the ring, [P - 2, 3]."""
+    return np.stack([np.full(len(ring) - 2, ring[0]), ring[1:-1], ring[2:]], -1)
 
 
 def palette(colors: Sequence[tuple[int, int, int]]) -> Image.Image:
@@ -190,12 +206,6 @@ def bake(
     )
 
 
-def _renumbered(indices: Sequence[np.ndarray], counts: Sequence[int]) -> np.ndarray:
-    """Return the index arrays as one, each shifted past those before it."""
-    shifts = np.cumsum([0, *counts[:-1]])
-    return np.concatenate([i + n for i, n in zip(indices, shifts, strict=True)])
-
-
 def _texture_coordinates(
     color: np.ndarray, normals: np.ndarray, colors: int, light: Sequence[float]
 ) -> np.ndarray:
@@ -216,67 +226,3 @@ def _smooth_normals(surface: Surface) -> np.ndarray:
         np.add.at(normals, (corner, surface.groups), areas)
     length = np.linalg.norm(normals, axis=-1, keepdims=True)
     return normals / np.where(length > 0, length, 1)
-
-
-class _Builder:
-    """Collects the triangles of one loft along its axis w, in (w, u, v)."""
-
-    def __init__(self, segments: int) -> None:
-        self._segments = segments
-        self._vertices: list[np.ndarray] = []
-        self._rings: list[np.ndarray] = []
-        self._faces: list[tuple[int, int, int]] = []
-        self._colors: list[int] = []
-        self._groups: list[int] = []
-        self._cells: list[int] = []
-        self._group = 0
-        self._cell = 0
-
-    def add_ring(self, section: Section) -> None:
-        """Add the points of a section, or the one point of a closed end."""
-        first = len(self._vertices)
-        if not any(section.half):
-            self._vertices.append(np.array([section.at, *section.center]))
-            self._rings.append(np.full(self._segments, first))
-            return
-        angle = (np.arange(self._segments) + 0.5) * 2 * np.pi / self._segments
-        for wave in np.stack([np.cos(angle), np.sin(angle)], -1):
-            point = np.sign(wave) * np.abs(wave) ** (2 / section.power)
-            u, v = section.center + np.array(section.half) * point
-            self._vertices.append(np.array([section.at, u, v]))
-        self._rings.append(first + np.arange(self._segments))
-
-    def add_span(self, span: int, color: int) -> None:
-        """Add the skin between section `span` and the next."""
-        low, high = self._rings[span : span + 2]
-        for i in range(self._segments):
-            j = (i + 1) % self._segments
-            self._add_face((low[i], low[j], high[j]), color)
-            self._add_face((low[i], high[j], high[i]), color)
-            self._cell += 1
-
-    def add_lid(self, ring: int, color: int, up: bool) -> None:
-        """Add a flat lid that looks up or down the axis, with a hard edge."""
-        self._group += 1
-        points = self._rings[ring]
-        points = points if up else points[::-1]
-        for a, b in pairwise(points[1:]):
-            self._add_face((points[0], a, b), color)
-        self._cell += 1
-
-    def surface(self, axis: int) -> Surface:
-        """Return the surface with w along the given axis."""
-        return Surface(
-            np.roll(np.array(self._vertices), axis, axis=1),
-            np.array(self._faces),
-            np.array(self._colors),
-            np.array(self._groups),
-            np.array(self._cells),
-        )
-
-    def _add_face(self, corners: tuple[int, int, int], color: int) -> None:
-        if len(set(corners)) == 3:
-            self._faces.append(corners)
-            self._colors.append(color)
-            self._groups.append(self._group)
-            self._cells.append(self._cell)

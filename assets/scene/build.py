@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 
 from ir_maniskill.assets.nao import SOLE_HEIGHT
-from ir_maniskill.assets.nao.shapes import Surface, bake, join, knob
+from ir_maniskill.assets.nao.shapes import Section, Surface, bake, join, loft
 from ir_maniskill.environment.table_scene import TABLE_THICKNESS, TABLE_TOP
 from ir_maniskill.experiment import TABLE
 
@@ -82,9 +82,8 @@ def room() -> Surface:
 
 def button() -> trimesh.Trimesh:
     """Return a round button that stands upright; its color is given at load."""
-    surface = knob([0] * len(BUTTON_PROFILE), BUTTON_PROFILE, BUTTON_SEGMENTS).turned(
-        0, -np.pi / 2, 0
-    )
+    sections = [Section(at, (radius, radius), 0) for at, radius in BUTTON_PROFILE]
+    surface = loft("x", BUTTON_SEGMENTS, sections).turned(0, -np.pi / 2, 0)
     mesh = bake(surface, ((255, 255, 255),), _LIGHT)
     return trimesh.Trimesh(
         mesh.vertices, mesh.faces, vertex_normals=mesh.vertex_normals, process=False

@@ -9,13 +9,11 @@ Legend: N envs, E episodes, I instructions.
 from __future__ import annotations
 
 import contextlib
-import itertools
-import json
 import math
 import os
 import platform
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -24,9 +22,10 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from ir_maniskill.checks import require
 from ir_maniskill.environment.senses import State, StateStack
-from ir_maniskill.environment.vector import VectorEnv, info_of_step, make_vec
-from ir_maniskill.files import replacing
+from ir_maniskill.environment.vector import VectorEnv, info_of_step
+from ir_maniskill.files import write_json
 
 Policy = Callable[[State], Tensor]
 """Maps the state s_t of N envs to their actions [N, 26] in [-1, 1]."""
@@ -108,6 +107,14 @@ class Score:
             "return": self.mean_return,
         }
 
+    def __str__(self) -> str:
+        return (
+            f"{self.success.total:>5}  {self.success!s:<20}  {self.exclusive!s:<20}  "
+            f"{100 * self.holding:>7.1f}%  "
+            f"{self.right_fingers:>11.2f} / {self.wrong_fingers:<5.2f}  "
+            f"{self.mean_return:>6.2f}"
+        )
+
 
 @dataclass(frozen=True)
 class EvaluationReport:
@@ -135,109 +142,24 @@ class EvaluationReport:
         }
 
     def __str__(self) -> str:
-        rows = [*self.instructions.items()]
-        if len(rows) > 1:
-            rows.append(("all", self.overall))
+        rows = [*self.instructions.items(), ("all", self.overall)]
+        rows = rows if len(self.instructions) > 1 else rows[:1]
         width = max(len(name) for name, _ in rows)
         head = (
             f"{'instruction':<{width}}     N  success [95%]         "
             "exclusive [95%]        holding  fingers right/wrong  return"
         )
-        return "\n".join([head, *(_row(name, score, width) for name, score in rows)])
-
-
-@dataclass(frozen=True)
-class SceneReport:
-    """How often a policy obeys in one and the same scene, whatever it is told.
-
-    A policy that neither looks nor reads may have every single score by chance or by
-    habit; only one that does both obeys all sentences in a shuffled scene.
-    """
-
-    env_id: str
-    """The task."""
-    seed: int
-    """Seed of the first scene; scene e has seed + e."""
-    exclusive: Rate
-    """Scenes in which it did what was asked without a foul, for every sentence."""
-    pairs: dict[tuple[str, str], Rate]
-    """The same for every two sentences."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain data for JSON."""
-        return {
-            "env_id": self.env_id,
-            "seed": self.seed,
-            "scenes": self.exclusive.total,
-            **self.exclusive.as_dict("exclusive"),
-            "pairs": [
-                {"sentences": list(pair), **rate.as_dict("exclusive")}
-                for pair, rate in self.pairs.items()
-            ],
-        }
-
-
-def _row(name: str, score: Score, width: int) -> str:
-    return (
-        f"{name:<{width}} {score.success.total:>5}  {score.success!s:<20}  "
-        f"{score.exclusive!s:<20}  {100 * score.holding:>7.1f}%  "
-        f"{score.right_fingers:>11.2f} / {score.wrong_fingers:<5.2f}  "
-        f"{score.mean_return:>6.2f}"
-    )
-
-
-@dataclass
-class _Record:
-    """Per-episode sums over the steps, E episodes."""
-
-    episodes: int
-    success: Tensor = field(init=False)  # [E]
-    exclusive: Tensor = field(init=False)  # [E]
-    sums: Tensor = field(init=False)  # [E, 5]: see SUMS
-
-    SUMS = ("steps", "holding", "right_fingers", "wrong_fingers", "return")
-
-    def __post_init__(self) -> None:
-        self.success = torch.zeros(self.episodes, dtype=torch.bool)
-        self.exclusive = torch.zeros(self.episodes, dtype=torch.bool)
-        self.sums = torch.zeros(self.episodes, len(self.SUMS), dtype=torch.float64)
-
-    def add(
-        self, episode: Tensor, env: Tensor, reward: Tensor, info: dict[str, Tensor]
-    ) -> None:
-        """Count one step of the episodes that the chosen envs play."""
-        names = ("success", "right_fingers", "wrong_fingers")
-        holds, right, wrong = (info[name][env].cpu() for name in names)
-        step = (torch.ones_like(right), holds, right, wrong, reward[env].cpu())
-        self.sums[episode] += torch.stack([x.double() for x in step], dim=1)
-        self.success[episode] = info["success_once"][env].cpu()
-        self.exclusive[episode] = info["exclusive_success"][env].cpu()
-
-    def score(self, chosen: Tensor) -> Score:
-        """Return the score of the chosen episodes [E] bool."""
-        total = int(chosen.sum())
-        sums = dict(zip(self.SUMS, self.sums[chosen].sum(dim=0).tolist(), strict=True))
-        return Score(
-            success=Rate(int(self.success[chosen].sum()), total),
-            exclusive=Rate(int(self.exclusive[chosen].sum()), total),
-            holding=sums["holding"] / sums["steps"],
-            right_fingers=sums["right_fingers"] / sums["steps"],
-            wrong_fingers=sums["wrong_fingers"] / sums["steps"],
-            mean_return=sums["return"] / total,
-        )
+        return "\n".join([head, *(f"{name:<{width}} {score}" for name, score in rows)])
 
 
 def evaluate_policy(
     policy: Policy,
-    env_id: str,
+    envs: VectorEnv,
     *,
     episodes: int,
     seed: int,
-    num_envs: int = 8,
     frames: int = 3,
-    env_kwargs: dict[str, Any] | None = None,
-    envs: VectorEnv | None = None,
-    instructions: Sequence[int] | None = None,
+    instructions: Sequence[int | str] | None = None,
     progress: bool = False,
 ) -> EvaluationReport:
     """Play episodes with a policy and count what it does.
@@ -247,87 +169,66 @@ def evaluate_policy(
 
     Args:
         policy: Acts without noise on the state s_t.
-        env_id: The task of the envs to make.
+        envs: The task, in as many envs as play at a time. They are left open.
         episodes: How many episodes; at least one for each instruction.
         seed: Seed of the first episode.
-        num_envs: Envs to make, unless `envs` are given.
         frames: S, observations stacked into a state.
-        env_kwargs: Keyword arguments for the envs (obs_mode, control_mode, ...).
-        envs: Envs to use, and to leave open, instead of making some.
         instructions: Which of the experiment's instructions; None: all.
         progress: Whether to show a progress bar.
 
     Raises:
         ValueError: Too few episodes, or an instruction that the task does not have.
     """
-    _check_episodes(episodes)
-    with _opened(envs, env_id, min(num_envs, episodes), env_kwargs) as envs:
-        sentences = tuple(envs.experiment.sentences)
-        chosen = choose_instructions(sentences, instructions)
-        _check_episodes(episodes, len(chosen))
-        told = torch.tensor([chosen[e % len(chosen)] for e in range(episodes)])  # [E]
-        record = _play(policy, envs, told, seed, StateStack(frames), progress)
+    sentences = envs.experiment.sentences
+    chosen = choose_instructions(sentences, instructions)
+    if episodes < len(chosen):
+        raise ValueError(
+            f"episodes: got {episodes}, expected at least {len(chosen)}, "
+            "one for each instruction"
+        )
+    told = torch.tensor([chosen[e % len(chosen)] for e in range(episodes)])  # [E]
+    figures = _play(policy, envs, told, seed, StateStack(frames), progress)
     return EvaluationReport(
         env_id=envs.experiment.id,
         seed=seed,
         episodes=episodes,
-        instructions={sentences[i]: record.score(told == i) for i in chosen},
-        overall=record.score(torch.ones(episodes, dtype=torch.bool)),
+        instructions={sentences[i]: _score(figures[told == i]) for i in chosen},
+        overall=_score(figures),
     )
 
 
 def evaluate_scenes(
     policy: Policy,
-    env_id: str,
+    envs: VectorEnv,
     *,
     scenes: int,
     seed: int,
-    num_envs: int = 8,
     frames: int = 3,
-    env_kwargs: dict[str, Any] | None = None,
-    envs: VectorEnv | None = None,
     progress: bool = False,
-) -> SceneReport:
-    """Play every scene once for each sentence and count where all are obeyed.
+) -> Rate:
+    """Return in how many scenes every sentence is obeyed, without a foul.
+
+    A policy that neither looks nor reads may have every single score by chance or by
+    habit; only one that does both obeys all sentences in a shuffled scene.
 
     Args:
         policy: Acts without noise on the state s_t.
-        env_id: The task of the envs to make.
-        scenes: How many; as many episodes are played for every sentence.
-        seed: Seed of the first scene.
-        num_envs: Envs to make, unless `envs` are given.
+        envs: The task, in as many envs as play at a time. They are left open.
+        scenes: How many; each is played once for every sentence.
+        seed: Seed of the first scene; scene e has seed + e.
         frames: S, observations stacked into a state.
-        env_kwargs: Keyword arguments for the envs (obs_mode, control_mode, ...).
-        envs: Envs to use, and to leave open, instead of making some.
         progress: Whether to show a progress bar.
 
     Raises:
         ValueError: No scenes.
     """
-    if scenes < 1:
-        raise ValueError(f"scenes: got {scenes}, expected at least 1")
-    with _opened(envs, env_id, min(num_envs, scenes), env_kwargs) as envs:
-        sentences = tuple(envs.experiment.sentences)
-        obeyed = {}  # [E] bool each
-        for index, sentence in enumerate(sentences):
-            told = torch.full((scenes,), index)
-            record = _play(policy, envs, told, seed, StateStack(frames), progress)
-            obeyed[sentence] = record.exclusive
-    return SceneReport(
-        env_id=envs.experiment.id,
-        seed=seed,
-        exclusive=_all_of(obeyed.values()),
-        pairs={
-            pair: _all_of(obeyed[sentence] for sentence in pair)
-            for pair in itertools.combinations(sentences, 2)
-        },
-    )
-
-
-def _all_of(obeyed: Iterable[Tensor]) -> Rate:
-    """Return the share of scenes in which all hold, each [E] bool."""
-    every = torch.stack(list(obeyed)).all(dim=0)
-    return Rate(int(every.sum()), len(every))
+    require(scenes >= 1, "scenes", scenes, "at least 1")
+    obeyed = torch.ones(scenes, dtype=torch.bool)
+    for index in range(len(envs.experiment.sentences)):
+        told = torch.full((scenes,), index)
+        figures = _play(policy, envs, told, seed, StateStack(frames), progress)
+        obeyed &= figures[:, FIGURES.index("exclusive")] > 0
+    return Rate(int(obeyed.sum()), scenes)
 
 
 def write_report(path: Path, report: EvaluationReport, **facts: Any) -> None:
@@ -338,9 +239,8 @@ def write_report(path: Path, report: EvaluationReport, **facts: Any) -> None:
         report: What was measured.
         **facts: More to write down: the checkpoint, the configuration, ...
     """
-    data = {**report.as_dict(), **facts, "versions": versions(), "machine": machine()}
-    with replacing(path) as aside:
-        aside.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
+    made = {"versions": versions(), "machine": machine()}
+    write_json(path, {**report.as_dict(), **facts, **made})
 
 
 def versions() -> dict[str, str]:
@@ -357,80 +257,38 @@ def machine() -> dict[str, Any]:
     return {"platform": system, "cpus": os.cpu_count(), "cuda": cuda}
 
 
-@contextlib.contextmanager
-def _opened(
-    envs: VectorEnv | None, env_id: str, num_envs: int, kwargs: dict[str, Any] | None
-) -> Iterator[VectorEnv]:
-    """Lend the envs given, or else some that are closed at the end.
-
-    Callers never make more envs than episodes: those would play what nobody counts.
-    """
-    with contextlib.ExitStack() as stack:
-        if envs is None:
-            envs = make_vec(env_id, num_envs, **(kwargs or {}))
-            stack.enter_context(contextlib.closing(envs))
-        # One row of a policy is too little to share: the cores are the simulator's.
-        stack.enter_context(threads(1))
-        yield envs
-
-
-def _check_episodes(episodes: int, least: int = 1) -> None:
-    if episodes < least:
-        raise ValueError(
-            f"episodes: got {episodes}, expected at least {least}, "
-            "one for each instruction"
-        )
-
-
 def choose_instructions(
-    sentences: Sequence[str], wanted: Sequence[int] | None
+    sentences: Sequence[str], wanted: Sequence[int | str] | None
 ) -> tuple[int, ...]:
     """Return the indices of the instructions to play.
 
     Args:
         sentences: The I sentences of the experiment.
-        wanted: Which of them; None: all.
+        wanted: Which of them, by index or, but for its case and its full stop, by the
+            sentence; None: all.
 
     Raises:
         ValueError: None is wanted, or one that there is not.
     """
-    everything = range(len(sentences))
-    chosen = tuple(everything if wanted is None else wanted)
-    if not chosen or any(index not in everything for index in chosen):
+    known = {_plain(sentence): index for index, sentence in enumerate(sentences)}
+    found = range(len(sentences)) if wanted is None else wanted
+    chosen = tuple(known.get(_plain(i), -1) if isinstance(i, str) else i for i in found)
+    if not chosen or any(index not in range(len(sentences)) for index in chosen):
         listed = ", ".join(f"{i}: {s!r}" for i, s in enumerate(sentences))
-        raise ValueError(f"instructions: got {chosen}, available: {listed}")
+        got = ", ".join(map(repr, found))
+        raise ValueError(f"instructions: got ({got}), available: {listed}")
     return chosen
 
 
-@torch.no_grad()  # envs may keep what they get, and write to it later
-def _play(
-    policy: Policy,
-    envs: VectorEnv,
-    told: Tensor,  # [E]
-    seed: int,
-    stack: StateStack,
-    progress: bool,
-) -> _Record:
-    """Play all episodes, N at a time; episode e is told instruction told[e]."""
-    episodes, n = len(told), envs.num_envs
-    record = _Record(episodes)
-    for first in tqdm(
-        range(0, episodes, n), "evaluate", disable=not progress, leave=False
-    ):
-        episode = torch.arange(first, first + n)  # [N]
-        options = {"instruction": told[episode % episodes].to(envs.device)}
-        obs, _ = envs.reset(seed=seed + first, options=options)
-        state = stack.reset(obs)
-        playing = episode < episodes  # the last round may have envs to spare
-        while playing.any():
-            action = _act(policy, state, envs.device)
-            obs, reward, terminated, truncated, info = envs.step(action)
-            done = terminated | truncated
-            env = playing.nonzero()[:, 0]
-            record.add(episode[env], env, reward, info_of_step(info, done))
-            playing &= ~done.cpu()
-            state = stack.push(obs, done)
-    return record
+def _plain(sentence: str) -> str:
+    return sentence.lower().strip().rstrip(".")
+
+
+FIGURES = (
+    *("success", "exclusive"),  # of the whole episode, 0 or 1
+    *("steps", "holding", "right_fingers", "wrong_fingers", "return"),  # summed over it
+)
+"""What is counted of an episode."""
 
 
 @contextlib.contextmanager
@@ -442,6 +300,65 @@ def threads(count: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+@threads(1)  # the cores are the simulator's: one row of a policy is too little to share
+@torch.no_grad()  # envs may keep what they get, and write to it later
+def _play(
+    policy: Policy,
+    envs: VectorEnv,
+    told: Tensor,  # [E]
+    seed: int,
+    stack: StateStack,
+    progress: bool,
+) -> Tensor:
+    """Play all episodes, N at a time; episode e is told instruction told[e].
+
+    Returns:
+        `FIGURES` of each episode [E, 7] float64.
+    """
+    episodes, n = len(told), envs.num_envs
+    figures = torch.zeros(episodes, len(FIGURES), dtype=torch.float64)
+    firsts = range(0, episodes, n)
+    for first in tqdm(firsts, "evaluate", disable=not progress, leave=False):
+        episode = torch.arange(first, first + n)  # [N]
+        options = {"instruction": told[episode % episodes].to(envs.device)}
+        obs, _ = envs.reset(seed=seed + first, options=options)
+        state = stack.reset(obs)
+        playing = episode < episodes  # the last round may have envs to spare
+        while playing.any():
+            action = _act(policy, state, envs.device)
+            obs, reward, terminated, truncated, info = envs.step(action)
+            done = terminated | truncated
+            step = _measured(reward, info_of_step(info, done))[playing]
+            figures[episode[playing], :2] = step[:, :2]
+            figures[episode[playing], 2:] += step[:, 2:]
+            playing &= ~done.cpu()
+            state = stack.push(obs, done)
+    return figures
+
+
+def _measured(reward: Tensor, info: dict[str, Tensor]) -> Tensor:
+    """Return the `FIGURES` of one step [N, 7]."""
+    so_far = info["success_once"], info["exclusive_success"]
+    now = info["success"], info["right_fingers"], info["wrong_fingers"], reward
+    columns = (*so_far, torch.ones_like(reward), *now)
+    return torch.stack([column.cpu().double() for column in columns], dim=1)
+
+
+def _score(figures: Tensor) -> Score:
+    """Return the score of episodes, of which `FIGURES` are given [E, 7]."""
+    total = len(figures)
+    success, exclusive, steps, *sums, returns = figures.sum(dim=0).tolist()
+    holding, right, wrong = (value / steps for value in sums)
+    return Score(
+        success=Rate(int(success), total),
+        exclusive=Rate(int(exclusive), total),
+        holding=holding,
+        right_fingers=right,
+        wrong_fingers=wrong,
+        mean_return=returns / total,
+    )
 
 
 def _act(policy: Policy, state: State, device: torch.device) -> Tensor:

@@ -9,21 +9,23 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ir_maniskill.files import replacing
 from ir_maniskill.training.run_folder import whole_rows
 
-TRAINING = (
-    ("train/success", "episodes that reach the goal"),
-    ("train/exclusive", "and nothing else"),
-    ("train/holding", "steps in which it holds"),
+Row = Mapping[str, float]
+
+SHARES = (
+    ("success", "episodes that reach the goal", "#2f6fde"),
+    ("exclusive", "and nothing else", "#22a06b"),
+    ("holding", "steps in which it holds", "#9aa3b2"),
 )
-"""Columns of metrics.csv that are shares, and what the legend calls them."""
-COLORS = ("#2f6fde", "#22a06b", "#9aa3b2")
-"""One for each of TRAINING."""
+"""What metrics.csv and evaluations.csv have shares of, its name and its color."""
 CURVE_COLORS = ("#2f6fde", "#d9730d", "#22a06b", "#8250df", "#9aa3b2")
 """Colors of compared curves, in turn."""
 COMPARED = (
@@ -41,10 +43,9 @@ class PlotError(ValueError):
 
 
 def learning_curve(run: Path, out: Path | None = None) -> Path:
-    """Draw success, touch and return over the steps of a run.
+    """Draw success and return over the steps of a run, and return the picture's file.
 
-    Lines are the exploring policy, dots its evaluations without noise; "it" is the
-    object that the sentence names.
+    Lines are the exploring policy, dots its evaluations without noise.
 
     Args:
         run: Folder of the run, with metrics.csv and, after the first evaluation,
@@ -59,17 +60,28 @@ def learning_curve(run: Path, out: Path | None = None) -> Path:
         raise PlotError(f"{run}: got no metrics.csv with rows, expected a run's folder")
     evaluations = _read(run / "evaluations.csv")
     figure = Figure(figsize=(8.0, 5.6), dpi=150, layout="constrained")
-    shares, returns = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
-    _draw_shares(shares, metrics, evaluations)
-    _draw_lines(returns, metrics, "train/return", COLORS[0])
+    shares, returns = _panels(figure, heights=(2, 1))
+    dots: dict[str, Any] = {"marker": "o", "linestyle": "", "markersize": 6}
+    for name, label, color in SHARES:
+        line = _points(metrics, f"train/{name}", 100)
+        shares.plot(*line, color=color, linewidth=1.8, label=label)
+        shares.plot(*_points(evaluations, f"eval/{name}", 100), color=color, **dots)
+    shares.plot([], [], color=INK, label="evaluated without noise", **dots)
+    shares.set(ylim=(-3, 103), ylabel="Share [%]")
+    shares.legend(
+        loc="lower left",
+        bbox_to_anchor=(-0.01, 1.0),
+        ncols=len(SHARES) + 1,
+        frameon=False,
+        fontsize=8.5,
+        labelcolor=INK,
+        handlelength=1.2,
+        columnspacing=1.1,
+    )
+    line = _points(metrics, "train/return")
+    returns.plot(*line, color=CURVE_COLORS[0], linewidth=1.8)
     returns.set_ylabel("Return of an episode")
-    returns.set_xlabel("Environment steps")
-    for axes in (shares, returns):
-        _polish(axes)
-    path = out or run / "learning_curve.png"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
-    return path
+    return _save(figure, out or run / "learning_curve.png")
 
 
 @dataclass(frozen=True)
@@ -78,7 +90,7 @@ class Curve:
 
     label: str
     """What the legend calls them."""
-    runs: Sequence[Sequence[Mapping[str, float]]]
+    runs: Sequence[Sequence[Row]]
     """Rows of the evaluations.csv of each run."""
 
     def over_steps(self, column: str) -> tuple[np.ndarray, np.ndarray]:
@@ -88,23 +100,15 @@ class Curve:
         the last it is NaN.
         """
         steps = np.unique([row["steps"] for run in self.runs for row in run])
-        values = [
-            np.interp(
-                steps,
-                [row["steps"] for row in run],
-                [row[column] for row in run],
-                left=np.nan,
-                right=np.nan,
-            )
-            for run in self.runs
-        ]
+        curves = (_points(run, column) for run in self.runs)
+        values = [np.interp(steps, *c, left=np.nan, right=np.nan) for c in curves]
         return steps, np.array(values)
 
 
 def compare(
     curves: Sequence[Curve], out: Path, title: str, level: float | None = None
 ) -> Path:
-    """Draw ways of learning side by side.
+    """Draw ways of learning side by side, and return the picture's file.
 
     Each has a line for the mean of its runs and a band for their range, as far as all
     of them reach, and a thin line for every run.
@@ -116,13 +120,11 @@ def compare(
         level: Fingers a step to mark as the paper's; None: no such line.
     """
     figure = Figure(figsize=(8.0, 6.2), dpi=100, layout="constrained")
-    panels = figure.subplots(3, 1, sharex=True)
+    panels = _panels(figure, heights=(1, 1, 1))
     for axes, (column, name, scale) in zip(panels, COMPARED, strict=True):
         for curve, color in zip(curves, cycle(CURVE_COLORS)):
             _draw_range(axes, curve, column, scale, color)
-        axes.set_ylabel(name)
-        axes.set_ylim((-3, 103) if scale == 100 else (0, None))
-        _polish(axes)
+        axes.set(ylabel=name, ylim=(-3, 103) if scale == 100 else (0, None))
     fingers = panels[-1]
     if level is not None:
         fingers.axhline(level, color=INK, linewidth=1.2, linestyle="--")
@@ -137,7 +139,6 @@ def compare(
             fontsize=8.5,
         )
     fingers.set_xlim(left=0)
-    fingers.set_xlabel("Environment steps")
     figure.suptitle(title, color=INK)
     figure.legend(
         *fingers.get_legend_handles_labels(),
@@ -146,9 +147,7 @@ def compare(
         frameon=False,
         labelcolor=INK,
     )
-    out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out)
-    return out
+    return _save(figure, out)
 
 
 def _draw_range(
@@ -167,7 +166,7 @@ def _draw_range(
         axes.plot(steps, values.T, color=color, linewidth=0.7, alpha=0.6)
 
 
-def _read(table: Path) -> list[dict[str, float]]:
+def _read(table: Path) -> list[Row]:
     """Read a table of numbers; [] if it is missing."""
     try:
         return [{k: float(v) for k, v in row.items()} for row in whole_rows(table)]
@@ -177,47 +176,29 @@ def _read(table: Path) -> list[dict[str, float]]:
         raise PlotError(f"{table}: got {error}, expected a table of numbers") from error
 
 
-def _draw_shares(
-    axes: Axes, metrics: Sequence[dict[str, float]], tests: Sequence[dict[str, float]]
-) -> None:
-    for (name, label), color in zip(TRAINING, COLORS, strict=True):
-        _draw_lines(axes, metrics, name, color, label)
-        column = name.replace("train/", "eval/")
-        points = [(row["steps"], 100 * row[column]) for row in tests if column in row]
-        if points:
-            axes.plot(*zip(*points, strict=True), "o", color=color, markersize=6)
-    axes.set_ylim(-3, 103)
-    axes.set_ylabel("Share [%]")
-    axes.plot([], [], "o", color=INK, markersize=6, label="evaluated without noise")
-    axes.legend(
-        loc="lower left",
-        bbox_to_anchor=(-0.01, 1.0),
-        ncols=len(TRAINING) + 1,
-        frameon=False,
-        fontsize=8.5,
-        labelcolor=INK,
-        handlelength=1.2,
-        columnspacing=1.1,
-    )
+def _points(
+    rows: Sequence[Row], column: str, scale: float = 1
+) -> tuple[list[float], list[float]]:
+    """Return the steps and the values of the rows that have the column, [P] each."""
+    rows = [row for row in rows if column in row]
+    return [row["steps"] for row in rows], [scale * row[column] for row in rows]
 
 
-def _draw_lines(
-    axes: Axes,
-    metrics: Sequence[dict[str, float]],
-    column: str,
-    color: str,
-    label: str | None = None,
-) -> None:
-    scale = 100 if label else 1
-    points = [(row["steps"], scale * row[column]) for row in metrics if column in row]
-    if points:
-        axes.plot(*zip(*points, strict=True), color=color, linewidth=1.8, label=label)
+def _panels(figure: Figure, heights: Sequence[int]) -> list[Axes]:
+    """Return axes over the same steps, one below the other."""
+    panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
+    for axes in panels:
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.spines[["left", "bottom"]].set_color("#c9ced6")
+        axes.tick_params(colors=INK, length=0)
+        axes.grid(axis="y", color="#e7eaef", linewidth=0.8)
+        axes.set_axisbelow(True)
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g} k")
+    panels[-1].set_xlabel("Environment steps")
+    return list(panels)
 
 
-def _polish(axes: Axes) -> None:
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color("#c9ced6")
-    axes.tick_params(colors=INK, length=0)
-    axes.grid(axis="y", color="#e7eaef", linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g} k")
+def _save(figure: Figure, path: Path) -> Path:
+    with replacing(path) as aside:
+        figure.savefig(aside)
+    return path

@@ -100,81 +100,66 @@ def record(
     seed: int = 0,
     frames: int = 3,
     env_kwargs: dict[str, Any] | None = None,
-    instructions: Sequence[int] | None = None,
+    instructions: Sequence[int | str] | None = None,
 ) -> Iterator[Snapshot]:
-    """Play episodes and yield every step; instructions take turns.
+    """Play episodes and yield every step; the arguments are `evaluate_policy`'s.
 
-    Args:
-        policy: Acts without noise on the state s_t.
-        env_id: The task.
-        episodes: How many.
-        seed: Seed of the first; episode e has seed + e, as in an evaluation.
-        frames: S, observations stacked into a state.
-        env_kwargs: Keyword arguments for `gym.make`.
-        instructions: Which of the experiment's instructions; None: all.
-
-    Raises:
-        ValueError: No instruction, or one that the task does not have.
+    In place of envs it takes an id and keyword arguments for `gym.make`: what is filmed
+    is one env alone, beside a second one that draws.
     """
     with closing(gym.make(env_id, num_envs=1, **(env_kwargs or {}))) as env:
         base: Any = env.unwrapped
         told = choose_instructions(base.experiment.sentences, instructions)
-        with closing(_Stage(env_id, base.agent)) as stage:
+        with closing(_stage(env_id, base.agent)) as stage:
             for episode in range(episodes):
                 options = {"instruction": told[episode % len(told)]}
                 obs, _ = env.reset(seed=seed + episode, options=options)
                 yield from _play(policy, env, obs, StateStack(frames), stage)
 
 
-class _Stage:
-    """A second scene, in which the first is shown with shadows, large and sharp.
+def _stage(env_id: str, robot: Robot) -> gym.Env:
+    """Make a second scene, to show the first with shadows, large and sharp.
 
     Lights are a scene's, not a camera's: shadows in the policy's own scene would change
     what it sees.
     """
-
-    def __init__(self, env_id: str, robot: Robot) -> None:
-        camera = {
-            "width": round(VIEW[2] * SHARPNESS),
-            "height": round(VIEW[3] * SHARPNESS),
-            "pose": view(robot.scale, *VIEWPOINT),
-            "fov": 0.58,
-        }
-        self._env = gym.make(
-            env_id,
-            num_envs=1,
-            robot_uids=type(robot),
-            obs_mode="none",
-            render_mode="rgb_array",
-            enable_shadow=True,
-            human_render_camera_configs=camera,
-        )
-        self._env.reset(seed=0)
-
-    def show(self, state: dict[str, Any]) -> np.ndarray:
-        """Return the human view [H, W, 3] uint8 of a state of the other scene."""
-        base: Any = self._env.unwrapped
-        base.set_state_dict(state)
-        return _picture(self._env.render())
-
-    def close(self) -> None:
-        self._env.close()
+    camera = {
+        "width": round(VIEW[2] * SHARPNESS),
+        "height": round(VIEW[3] * SHARPNESS),
+        "pose": view(robot.scale, *VIEWPOINT),
+        "fov": 0.58,
+    }
+    stage = gym.make(
+        env_id,
+        num_envs=1,
+        robot_uids=type(robot),
+        obs_mode="none",
+        render_mode="rgb_array",
+        enable_shadow=True,
+        human_render_camera_configs=camera,
+    )
+    stage.reset(seed=0)
+    return stage
 
 
 @torch.no_grad()  # no inference mode: what the env keeps must stay changeable
 def _play(
-    policy: Policy, env: gym.Env, obs: Any, stack: StateStack, stage: _Stage
+    policy: Policy, env: gym.Env, obs: Any, stack: StateStack, stage: gym.Env
 ) -> Iterator[Snapshot]:
     """Play the episode that a reset has begun."""
     base: Any = env.unwrapped
+    shown: Any = stage.unwrapped
     state, total = stack.reset(obs), base.experiment.episode_steps
     right = wrong = [False] * len(base.agent.fingers)
     score = 0.0
     history: tuple[tuple[bool, bool], ...] = ()
     for step in range(total + 1):
+        shown.set_state_dict(base.get_state_dict())
         yield Snapshot(
-            view=stage.show(base.get_state_dict()),
-            cameras=_camera_pictures(obs),
+            view=_picture(stage.render()),
+            cameras={
+                name: _picture(obs["sensor_data"][name]["rgb"]) for name in cameras(obs)
+            },
             instruction=base.get_language_instruction()[0],
             hands=base.agent.hands,
             right=tuple(right),
@@ -196,12 +181,7 @@ def _play(
 
 def _picture(tensor: Any) -> np.ndarray:
     """Return a rendered batch of one as an image [H, W, 3] uint8."""
-    array = torch.as_tensor(tensor).cpu().numpy()
-    return array[0] if array.ndim == 4 else array
-
-
-def _camera_pictures(obs: dict[str, Any]) -> dict[str, np.ndarray]:
-    return {name: _picture(obs["sensor_data"][name]["rgb"]) for name in cameras(obs)}
+    return torch.as_tensor(tensor).cpu().numpy()[0]
 
 
 # -- Drawing -------------------------------------------------------------------------
@@ -211,14 +191,11 @@ def draw(snapshot: Snapshot) -> np.ndarray:
     """Draw a frame [720, 1280, 3] uint8."""
     page = _page().copy()
     _paste(page, snapshot.view, VIEW, radius=14)
-    pictures = zip(snapshot.cameras.values(), PICTURES, strict=False)
-    boxes = [_fit(picture, box) for picture, box in pictures]
-    for picture, box in zip(snapshot.cameras.values(), boxes, strict=False):
-        _paste(page, picture, box, radius=10)
     canvas = ImageDraw.Draw(page)
+    for (name, picture), box in zip(snapshot.cameras.items(), PICTURES, strict=False):
+        _draw_camera(page, name, picture, box)
     font = _fitting(snapshot.instruction, LEGEND[0] - 60, 34)
     canvas.text((32, 66), snapshot.instruction, INK, font, anchor="lm")
-    _label_cameras(canvas, snapshot.cameras, boxes)
     _draw_timeline(canvas, snapshot)
     _draw_hands(page, snapshot)
     _draw_counters(canvas, snapshot)
@@ -253,15 +230,18 @@ def _page() -> Image.Image:
     return page
 
 
-def _label_cameras(
-    canvas: ImageDraw.ImageDraw, pictures: dict[str, np.ndarray], boxes: Sequence[Box]
-) -> None:
-    for (camera, picture), box in zip(pictures.items(), boxes, strict=False):
-        x, y, width, _ = box
-        name = camera.replace("_", " ").upper()
-        canvas.text((x + 1, y - 10), name, FAINT, _font(12), anchor="ls")
-        size = "{} x {}".format(*picture.shape)  # height x width
-        canvas.text((x + width, y - 10), size, DIM, _font(12), anchor="rs")
+def _draw_camera(page: Image.Image, name: str, picture: np.ndarray, box: Box) -> None:
+    """Draw what a camera sees, as large as fits into the middle of a box."""
+    x, y, width, height = box
+    rows, columns, _ = picture.shape
+    scale = min(width / columns, height / rows)
+    wide, high = round(columns * scale), round(rows * scale)
+    x, y = x + (width - wide) // 2, y + (height - high) // 2
+    _paste(page, picture, (x, y, wide, high), radius=10)
+    canvas, title = ImageDraw.Draw(page), name.replace("_", " ").upper()
+    canvas.text((x + 1, y - 10), title, FAINT, _font(12), anchor="ls")
+    size = "{} x {}".format(*picture.shape)  # height x width
+    canvas.text((x + wide, y - 10), size, DIM, _font(12), anchor="rs")
 
 
 @cache
@@ -271,15 +251,6 @@ def _mask(width: int, height: int, radius: int) -> Image.Image:
     area = (0, 0, 4 * width - 1, 4 * height - 1)
     ImageDraw.Draw(large).rounded_rectangle(area, 4 * radius, 255)
     return large.resize((width, height), Image.Resampling.LANCZOS)
-
-
-def _fit(array: np.ndarray, box: Box) -> Box:
-    """Return the largest box of the picture's shape in the middle of a box."""
-    x, y, width, height = box
-    rows, columns = array.shape[:2]
-    scale = min(width / columns, height / rows)
-    wide, high = round(columns * scale), round(rows * scale)
-    return x + (width - wide) // 2, y + (height - high) // 2, wide, high
 
 
 def _paste(page: Image.Image, array: np.ndarray, box: Box, radius: int) -> None:
@@ -347,18 +318,13 @@ def _draw_light(
 ) -> None:
     """Draw a light with its name; it glows unless its color is that of an edge."""
     left, top = place
-    if color != EDGE:
-        _paste_shape(page, (left + 14, top - 5, 32, 32), _dim(color), 16)
+    lit = color != EDGE
+    if lit:
+        red, green, blue = ((c + 2 * d) // 3 for c, d in zip(color, CARD, strict=True))
+        _paste_shape(page, (left + 14, top - 5, 32, 32), (red, green, blue), 16)
     _paste_shape(page, (left + 20, top + 1, 20, 20), color, 10)
-    ink = INK if color != EDGE else FAINT
-    text = (left + 30, top + 29)
+    text, ink = (left + 30, top + 29), INK if lit else FAINT
     ImageDraw.Draw(page).text(text, name, ink, _font(12), anchor="mt")
-
-
-def _dim(color: Color) -> Color:
-    """Mix a color into the card's, for the glow around a light."""
-    red, green, blue = ((c + 2 * d) // 3 for c, d in zip(color, CARD, strict=True))
-    return red, green, blue
 
 
 def _draw_counters(canvas: ImageDraw.ImageDraw, snapshot: Snapshot) -> None:
@@ -381,19 +347,16 @@ def _draw_counters(canvas: ImageDraw.ImageDraw, snapshot: Snapshot) -> None:
 def write_video(
     path: Path, snapshots: Iterable[Snapshot], *, speed: float = 0.5, hold: float = 1.0
 ) -> int:
-    """Draw snapshots into an mp4, or into a small GIF if the name ends so.
+    """Draw what `record` yields into an mp4, or a small GIF; return how many it were.
 
     Args:
-        path: The file.
-        snapshots: What to show, from `record`.
+        path: The file; its name ends in .mp4 or .gif.
+        snapshots: At least one.
         speed: 1 is real time.
         hold: How long the last frame of an episode stays [s].
 
-    Returns:
-        The number of snapshots shown.
-
     Raises:
-        ValueError: The name ends in neither .mp4 nor .gif, or there is nothing to show.
+        ValueError: Of another name, or where there is nothing to show.
     """
     check_name(path)
     rate = CONTROL_FREQ * speed
@@ -424,15 +387,14 @@ def check_name(path: Path) -> None:
 
 def _write_mp4(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
     """Write H.264 with 4:2:0 colors, which every player knows."""
-    tuning = ["-crf", "20", "-preset", "medium", "-movflags", "+faststart"]
-    options: dict[str, Any] = {"pixelformat": "yuv420p", "quality": None}
     writer: Any = imageio.get_writer(
         path,
         format="FFMPEG",
         fps=rate,
         codec="libx264",
-        output_params=tuning,
-        **options,
+        pixelformat="yuv420p",
+        quality=None,
+        output_params=["-crf", "20", "-preset", "medium", "-movflags", "+faststart"],
     )
     written = 0
     with closing(writer):  # used as a context by itself, an error would leave it open
@@ -444,32 +406,21 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
         raise OSError(errno.EIO, "ffmpeg did not write all frames")
 
 
-def _palette(images: Sequence[Image.Image]) -> Image.Image:
-    """Choose colors for a film by some of its frames.
-
-    The octree keeps small things of a color of their own, such as a cube, apart; the
-    median cut merges them into what is large.
-    """
-    width, height = images[0].size
-    montage = Image.new("RGB", (width, height * len(images)))
-    for index, image in enumerate(images):
-        montage.paste(image, (0, height * index))
-    return montage.quantize(128, method=Image.Quantize.FASTOCTREE)
-
-
 def _write_gif(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
     """Write half the size, with one palette for all frames, to stay small."""
-    size = (SIZE[0] // 2, SIZE[1] // 2)
-    images = [
-        Image.fromarray(frame).resize(size, Image.Resampling.LANCZOS)
-        for frame in frames
-    ]
+    size, smooth = (SIZE[0] // 2, SIZE[1] // 2), Image.Resampling.LANCZOS
+    images = [Image.fromarray(frame).resize(size, smooth) for frame in frames]
     if not images:
         return
-    palette = _palette([images[0], images[len(images) // 2], images[-1]])
-    images = [
-        image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images
+    some = [
+        np.asarray(image) for image in (images[0], images[len(images) // 2], images[-1])
     ]
+    # The octree keeps small things of a color of their own, such as a cube, apart; the
+    # median cut merges them into what is large.
+    montage = Image.fromarray(np.concatenate(some))
+    palette = montage.quantize(128, method=Image.Quantize.FASTOCTREE)
+    plain = Image.Dither.NONE
+    images = [image.quantize(palette=palette, dither=plain) for image in images]
     images[0].save(
         path,
         save_all=True,

@@ -211,11 +211,10 @@ class Runner:
         random = checkpoint.random_state()
         report = evaluate_policy(
             agent.policy,
-            self.config.env_id,
+            self.eval_envs(),
             episodes=episodes,
             seed=seed,
             frames=self.config.frames,
-            envs=self.eval_envs(),
         )
         checkpoint.set_random_state(*random)
         return report
