@@ -134,7 +134,8 @@ def _prepare(
     try:
         policy.require_match(experiment, robot, any_task=any_task)
     except MismatchError as error:
-        hint = "" if any_task else "; name its task, or use any_task to try it here"
+        other = experiment.id != policy.env_id and not any_task
+        hint = "; name its task, or say any_task (--any-task) to try it here" * other
         raise MismatchError(f"{error}{hint}") from error
     wanted = None if instruction is None else [instruction]
     return policy, experiment, choose_instructions(experiment.sentences, wanted)

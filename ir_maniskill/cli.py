@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import logging
+import shlex
 import signal
 import sys
 import warnings
@@ -89,10 +90,9 @@ class Train:
         with distributed.group():
             best = train(config, resume=self.resume)
             if distributed.rank() == 0:
+                task, file = self.config.env_id, shlex.quote(str(best))
                 print(f"The best policy is in {best}.")
-                print(
-                    f"Next: ir-maniskill evaluate {config.env_id} --checkpoint {best}"
-                )
+                print(f"Next: ir-maniskill evaluate {task} --checkpoint {file}")
 
 
 @dataclasses.dataclass(frozen=True)

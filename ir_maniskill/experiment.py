@@ -372,7 +372,8 @@ def get(experiment_id: str) -> Experiment:
     except KeyError:
         raise UnknownExperimentError(
             f"unknown task id: got {experiment_id!r}, "
-            f"available: {', '.join(available())}"
+            f"available: {', '.join(available())}; for a task of your own write "
+            "MODULE:ID, where MODULE registers it"
         ) from None
 
 

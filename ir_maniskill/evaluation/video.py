@@ -24,6 +24,7 @@ import numpy as np
 import torch
 from matplotlib import font_manager
 from PIL import Image, ImageDraw, ImageFont
+from tqdm import tqdm
 
 from ir_maniskill.environment.robots.robot import Robot
 from ir_maniskill.environment.senses import StateStack, cameras
@@ -364,7 +365,7 @@ def write_video(
 
     def frames() -> Iterator[np.ndarray]:
         nonlocal count
-        for snapshot in snapshots:
+        for snapshot in tqdm(snapshots, "film", unit=" frames", leave=False):
             frame, last = draw(snapshot), snapshot.step == snapshot.total_steps
             count += 1
             yield from [frame] * (1 + round(hold * rate) * last)
