@@ -21,7 +21,7 @@ from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.senses import cameras
 from ir_maniskill.evaluation.evaluate import EVALUATION_SEED
 from ir_maniskill.evaluation.video import record, write_video
-from ir_maniskill.training.checkpoint import load_policy
+from ir_maniskill.training.checkpoint import load_agent
 
 FOLDER = Path(__file__).parent / "images"
 PAGE, INK, FAINT = (18, 20, 24), (238, 240, 244), (150, 156, 168)
@@ -123,7 +123,7 @@ def save(make: Callable[[], Image.Image], path: Path) -> None:
 def film(task: str, path: Path) -> None:
     """Write a film of the shipped policy, told every sentence in the same scene."""
     folder = Path(str(files("ir_maniskill.assets") / "policies"))
-    agent, config, _ = load_policy(folder / f"{task}.safetensors")
+    agent, config, _ = load_agent(folder / f"{task}.safetensors")
     play = partial(
         record,
         agent.policy,

@@ -25,7 +25,7 @@ from ir_maniskill.environment.senses import State
 from ir_maniskill.environment.vector import make_vec
 from ir_maniskill.evaluation.evaluate import EVALUATION_SEED, evaluate_policy
 from ir_maniskill.experiment import Experiment, tokenize
-from ir_maniskill.training.checkpoint import load_policy
+from ir_maniskill.training.checkpoint import load_agent
 
 ROOT = Path(__file__).parent.parent
 OUT = ROOT / "docs" / "results" / "controls.json"
@@ -93,7 +93,7 @@ def measure(path: Path, episodes: int) -> tuple[str, dict[str, Any]]:
         path: Policy or checkpoint file.
         episodes: Episodes of each control, spread evenly over the sentences.
     """
-    agent, config, facts = load_policy(path)
+    agent, config, facts = load_agent(path)
     play: dict[str, Any] = {"seed": EVALUATION_SEED, "frames": config.frames}
     figures = {}
     with closing(

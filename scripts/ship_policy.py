@@ -34,7 +34,7 @@ def ship(run: Path, episodes: int, scenes: int) -> EvaluationReport:
         scenes: Scenes in which to give it every sentence, if there are several.
     """
     stored = checkpoint.read(run / "best.safetensors")
-    agent, config, facts = checkpoint.load_policy(run / "best.safetensors")
+    agent, config, facts = checkpoint.load_agent(run / "best.safetensors")
     play: dict[str, Any] = {
         "seed": EVALUATION_SEED,
         "frames": config.frames,
