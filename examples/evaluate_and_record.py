@@ -22,7 +22,7 @@ from ir_maniskill.evaluation.evaluate import (
     write_report,
 )
 from ir_maniskill.evaluation.video import record, write_video
-from ir_maniskill.training.checkpoint import load_policy
+from ir_maniskill.training.checkpoint import load_agent
 from ir_maniskill.training.config import CONFIGS
 
 
@@ -41,7 +41,7 @@ def main(
     """Evaluate, print the figures, and write report.json and video.mp4."""
     policy, config = random_policy, CONFIGS["default"]
     if checkpoint is not None:
-        agent, config, _ = load_policy(checkpoint)
+        agent, config, _ = load_agent(checkpoint)
         policy = agent.policy
     task = task or config.env_id
     env_kwargs = config.env_kwargs(training=False)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.agent.agent import Agent
+from ir_maniskill.environment.robots.robot import short_name
 from ir_maniskill.environment.senses import (
     Observation,
     State,
@@ -20,7 +21,12 @@ from ir_maniskill.environment.senses import (
     tokens_of,
 )
 from ir_maniskill.experiment import Experiment, warn_of_unknown
-from ir_maniskill.training import checkpoint
+from ir_maniskill.training.checkpoint import (
+    CheckpointError,
+    MismatchError,
+    load_agent,
+    task_facts,
+)
 from ir_maniskill.training.config import TrainConfig
 
 
@@ -45,7 +51,7 @@ class Policy:
     def __init__(
         self, agent: Agent, config: TrainConfig, metadata: dict[str, Any]
     ) -> None:
-        """Take what `training.checkpoint.load_policy` returns."""
+        """Take what `training.checkpoint.load_agent` returns."""
         self.agent, self.config, self.metadata = agent, config, metadata
         self.reset()
 
@@ -120,9 +126,22 @@ class Policy:
         Raises:
             MismatchError: Naming all that is different.
         """
-        checkpoint.require_match(
-            self.config, self.metadata, experiment, robot, any_task=any_task
-        )
+        pairs: dict[str, tuple[Any, Any]] = {}
+        if self.vocabulary != experiment.vocabulary:
+            pairs["vocabulary"] = self.vocabulary, experiment.vocabulary
+        if robot is not None and short_name(robot) != short_name(self.config.robot):
+            pairs["robot"] = self.config.robot, robot
+        if not any_task and self.env_id != experiment.id:
+            pairs["task"] = self.env_id, experiment.id
+        elif not any_task:
+            then, now = self.metadata.get("task", {}), task_facts(experiment)
+            pairs |= {k: (then[k], now.get(k)) for k in then if then[k] != now.get(k)}
+        if pairs:
+            told = (_difference(name, *pair) for name, pair in pairs.items())
+            raise MismatchError(
+                f"policy trained for {self.env_id} does not fit {experiment.id}: "
+                + "; ".join(told)
+            )
 
     def _see(self, obs: Observation) -> State:
         """Add an observation to the history, and return the state."""
@@ -156,11 +175,11 @@ def load_policy(
         path = Path(id_or_path)
     if not path.exists():
         ids = ", ".join(name for name in catalog.available() if shipped(name).exists())
-        raise checkpoint.CheckpointError(
+        raise CheckpointError(
             f"policy: got {str(id_or_path)!r}, expected an existing file, or a task "
             f"whose policy ships with the package: {ids}"
         )
-    agent, config, metadata = checkpoint.load_policy(path)
+    agent, config, metadata = load_agent(path)
     chosen = device or ("cuda" if torch.cuda.is_available() else "cpu")
     return Policy(agent.to(chosen), config, metadata)
 
@@ -169,3 +188,12 @@ def shipped(task_id: str) -> Path:
     """Return where the policy of a task is, if it ships with the package."""
     folder = resources.files("ir_maniskill.assets") / "policies"
     return Path(str(folder / f"{task_id}.safetensors"))
+
+
+def _difference(name: str, got: Any, expected: Any) -> str:
+    """Return what differs; of long lists only the first place that does."""
+    lists = isinstance(got, list | tuple) and isinstance(expected, list | tuple)
+    if lists and len(got) == len(expected):
+        place = next(i for i, item in enumerate(got) if item != expected[i])
+        name, got, expected = f"{name}[{place}]", got[place], expected[place]
+    return f"{name}: got {got!r}, expected {expected!r}"

@@ -36,7 +36,7 @@ def ship(run: Path, episodes: int, scenes: int) -> EvaluationReport:
         scenes: Scenes in which to give it every sentence, if there are several.
     """
     stored = checkpoint.read(run / "best.safetensors")
-    agent, config, facts = checkpoint.load_policy(run / "best.safetensors")
+    agent, config, facts = checkpoint.load_agent(run / "best.safetensors")
     task, sentences = config.env_id, len(catalog.get(config.env_id).sentences)
     play: dict[str, Any] = {"frames": config.frames, "progress": True}
     play["seed"] = EVALUATION_SEED

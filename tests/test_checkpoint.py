@@ -19,6 +19,7 @@ from toy_envs import SPEC, ToyVectorEnv, toy_config, toy_state
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.agent import Agent
+from ir_maniskill.policy import Policy
 from ir_maniskill.training import checkpoint
 from ir_maniskill.training.algorithm import averages, copied
 from ir_maniskill.training.checkpoint import CheckpointError, MismatchError, Stored
@@ -66,7 +67,7 @@ def test_a_policy_acts_after_loading_as_before(trained, tmp_path):
     path = tmp_path / "policy.safetensors"
     facts = {"steps": 7, "evaluation": (figures := {"success": 1.0})}
     checkpoint.save_policy(path, agent, config, **facts)
-    loaded, stored_config, metadata = checkpoint.load_policy(path)
+    loaded, stored_config, metadata = checkpoint.load_agent(path)
     state = toy_state()
     assert torch.allclose(loaded.policy(state), agent.policy(state), atol=1e-3)
     assert stored_config == config
@@ -87,14 +88,14 @@ def test_what_is_counted_keeps_all_its_bits(tmp_path):
     agent.encoder.standardize.count.fill_(10**6)  # 16 bits end at 65504
     agent.encoder.standardize.variance.fill_(1e-6)
     checkpoint.save_policy(tmp_path / "p", agent, config, steps=1, evaluation={})
-    loaded, *_ = checkpoint.load_policy(tmp_path / "p")
+    loaded, *_ = checkpoint.load_agent(tmp_path / "p")
     assert torch.equal(loaded.encoder.standardize.variance, torch.full((7,), 1e-6))
 
 
 def test_a_policy_file_is_smaller_than_a_checkpoint(trained, tmp_path):
     small, large = write_both(tmp_path, *trained)
     assert small.stat().st_size < large.stat().st_size / 6
-    agent_of_checkpoint, _, _ = checkpoint.load_policy(large)
+    agent_of_checkpoint, _, _ = checkpoint.load_agent(large)
     assert agent_of_checkpoint.act(toy_state()).value.shape == (3,)
 
 
@@ -107,7 +108,7 @@ def test_a_crash_while_writing_leaves_the_old_file(trained, tmp_path, monkeypatc
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(CheckpointError, match=r"cannot write .*: No space left"):
+    with pytest.raises(OSError, match=r"cannot write .*: No space left"):
         checkpoint.save_policy(path, agent, config, steps=2, evaluation={})
     assert checkpoint.read(path).metadata["steps"] == 1
     assert [file.name for file in tmp_path.iterdir()] == ["policy"]
@@ -138,7 +139,7 @@ def test_broken_files_get_the_one_clear_error(trained, tmp_path):
                 data[place:place] = generator.randbytes(generator.randrange(1, 64))
             path.write_bytes(data)
             with pytest.raises(CheckpointError, match="not ours"):
-                checkpoint.load_policy(path)
+                checkpoint.load_agent(path)
 
 
 WRONG = (None, True, -1, 0, 10**4, 2**40, 2**80, 0.5, 1e308, math.nan, "x", [], {})
@@ -182,7 +183,7 @@ def test_files_of_wrong_values_work_or_get_the_error(trained, tmp_path):
         for _ in range(50):
             checkpoint.write(path, distort(stored, generator))
             try:
-                agent, *_ = checkpoint.load_policy(path)
+                agent, *_ = checkpoint.load_agent(path)
                 assert agent.policy(toy_state()).isfinite().all()
             except CheckpointError:
                 refused += 1
@@ -216,7 +217,7 @@ def test_foreign_files_are_refused(tmp_path, data):
     path = tmp_path / "foreign"
     path.write_bytes(data)
     with pytest.raises(CheckpointError, match="not ours"):
-        checkpoint.load_policy(path)
+        checkpoint.load_agent(path)
 
 
 def test_a_file_of_a_later_version_says_so(trained, tmp_path, monkeypatch):
@@ -225,14 +226,14 @@ def test_a_file_of_a_later_version_says_so(trained, tmp_path, monkeypatch):
     checkpoint.save_policy(tmp_path / "new", agent, config, steps=1, evaluation={})
     monkeypatch.undo()
     with pytest.raises(CheckpointError, match=r"format 3, written by ir_maniskill \d"):
-        checkpoint.load_policy(tmp_path / "new")
+        checkpoint.load_agent(tmp_path / "new")
 
 
 def test_what_is_no_file_is_refused_without_waiting(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "pipe", tmp_path, Path("/dev/zero")):
         with pytest.raises(CheckpointError, match="expected a file"):
-            checkpoint.load_policy(path)
+            checkpoint.load_agent(path)
 
 
 def test_numbers_that_are_not_finite_are_neither_written_nor_read(
@@ -249,7 +250,7 @@ def test_numbers_that_are_not_finite_are_neither_written_nor_read(
     monkeypatch.setattr(checkpoint, "check_finite", lambda *_: None)
     checkpoint.save_policy(path, agent, config, steps=2, evaluation={})
     with pytest.raises(CheckpointError, match=r"actor.mean.0.bias is not finite"):
-        checkpoint.load_policy(path)
+        checkpoint.load_agent(path)
 
 
 def test_a_checkpoint_of_wrong_values_is_resumed_or_refused(tmp_path):
@@ -279,13 +280,13 @@ def test_a_pickle_is_never_executed(tmp_path):
 
     torch.save(Evil(), path)
     with pytest.raises(CheckpointError):
-        checkpoint.load_policy(path)
+        checkpoint.load_agent(path)
     assert not witness.exists()
 
 
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(CheckpointError, match=r"cannot read .*nothing: No such file"):
-        checkpoint.load_policy(tmp_path / "nothing")
+        checkpoint.load_agent(tmp_path / "nothing")
 
 
 def test_weights_of_another_size_than_their_config_are_refused(trained, tmp_path):
@@ -296,7 +297,7 @@ def test_weights_of_another_size_than_their_config_are_refused(trained, tmp_path
     weights = {k: v for k, v in agent.state_dict().items() if "critic" not in k}
     checkpoint.write(path, Stored(checkpoint.POLICY, weights, facts))
     with pytest.raises(CheckpointError, match=r"do not belong together.*size mismatch"):
-        checkpoint.load_policy(path)
+        checkpoint.load_agent(path)
 
 
 # -- Files of 0.1 ----------------------------------------------------------------------
@@ -321,15 +322,16 @@ def task():
     return catalog.get("NaoTouchCubeTriangle-v1")
 
 
-def facts_of(task):
-    """Return the config and the metadata of a policy trained for a task, from JSON."""
+def policy_for(task):
+    """Return a policy trained for a task, with its metadata from JSON."""
     config = TrainConfig(env_id=task.id, agent=AgentConfig(vocabulary=task.vocabulary))
     agent = SimpleNamespace(config=config.agent, spec=SPEC)
-    return config, json.loads(json.dumps(checkpoint.describe(agent, config)))
+    facts = json.loads(json.dumps(checkpoint.describe(agent, config)))
+    return Policy(agent, config, facts)
 
 
 def test_a_policy_file_tells_task_words_robot_and_longest_sentence(task):
-    _, facts = facts_of(task)
+    facts = policy_for(task).metadata
     told = facts["config"]["agent"]
     assert facts["env_id"] == "NaoTouchCubeTriangle-v1"
     assert told["vocabulary"] == list(task.vocabulary)
@@ -339,8 +341,8 @@ def test_a_policy_file_tells_task_words_robot_and_longest_sentence(task):
 
 
 def test_a_policy_meets_what_it_was_trained_for(task):
-    checkpoint.require_match(*facts_of(task), task)
-    checkpoint.require_match(*facts_of(task), task, "nao")
+    policy_for(task).require_match(task)
+    policy_for(task).require_match(task, "nao")
 
 
 def swapped(words):
@@ -376,16 +378,16 @@ def swapped(words):
 def test_a_task_that_changed_is_refused(task, change, message):
     now = dataclasses.replace(task, **change(task))
     with pytest.raises(MismatchError, match=message):
-        checkpoint.require_match(*facts_of(task), now)
+        policy_for(task).require_match(now)
 
 
 def test_another_task_or_robot_is_refused(task):
     other = catalog.get("NaoTouchCubeShuffled-v1")
     with pytest.raises(MismatchError, match="not fit NaoTouchCubeShuffled-v1: task"):
-        checkpoint.require_match(*facts_of(task), other)
-    checkpoint.require_match(*facts_of(task), other, any_task=True)
+        policy_for(task).require_match(other)
+    policy_for(task).require_match(other, any_task=True)
     words = dataclasses.replace(other, vocabulary=swapped(other.vocabulary))
     with pytest.raises(MismatchError, match=r"vocabulary\[5\]"):
-        checkpoint.require_match(*facts_of(task), words, any_task=True)
+        policy_for(task).require_match(words, any_task=True)
     with pytest.raises(MismatchError, match="robot: .*'nao', expected 'panda'"):
-        checkpoint.require_match(*facts_of(task), task, "panda")
+        policy_for(task).require_match(task, "panda")

@@ -116,7 +116,7 @@ def test_a_checkpoint_is_played_on_the_task_that_is_named(
 ) -> None:
     main = runpy.run_path(script("evaluate_and_record.py"))["main"]
     played = []
-    fakes = {"load_policy": lambda path: (SimpleNamespace(policy=None), MULTI, {})}
+    fakes = {"load_agent": lambda path: (SimpleNamespace(policy=None), MULTI, {})}
     fakes["make_vec"] = lambda task, *_, **__: SimpleNamespace(
         task=task, close=lambda: None
     )

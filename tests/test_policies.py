@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ir_maniskill import make_vec
 from ir_maniskill.evaluation.evaluate import Policy, Score, evaluate_policy
-from ir_maniskill.training.checkpoint import load_policy
+from ir_maniskill.training.checkpoint import load_agent
 from ir_maniskill.training.config import TrainConfig
 
 SHIPPED = sorted(Path(str(files("ir_maniskill.assets"))).glob("policies/*.safetensors"))
@@ -34,7 +34,7 @@ def test_there_are_shipped_policies() -> None:
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_a_shipped_policy_says_where_it_comes_from(path: Path) -> None:
-    _, config, facts = load_policy(path)
+    _, config, facts = load_agent(path)
     assert config.env_id == path.stem
     assert facts["steps"] >= 2048
     figures = facts["evaluation"]
@@ -46,7 +46,7 @@ def test_a_shipped_policy_says_where_it_comes_from(path: Path) -> None:
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_a_policy_of_0_1_acts_as_it_did(path: Path) -> None:
-    agent, _, facts = load_policy(path)
+    agent, _, facts = load_agent(path)
     if "version" in facts:
         pytest.skip("trained by a later version")
     recorded = np.load(Path(__file__).parent / "data" / "policy_actions_0_1.npz")
@@ -58,7 +58,7 @@ def test_a_policy_of_0_1_acts_as_it_did(path: Path) -> None:
 @pytest.mark.render
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_a_shipped_policy_does_what_it_is_told(path: Path) -> None:
-    agent, config, _ = load_policy(path)
+    agent, config, _ = load_agent(path)
     score = play(agent.policy, config, episodes=6)
     assert score.exclusive.value >= 5 / 6  # none sweeps up whatever there is
     assert score.holding > 0.6
@@ -69,7 +69,7 @@ def test_a_shipped_policy_does_what_it_is_told(path: Path) -> None:
 def test_where_colors_are_shuffled_a_policy_is_lost_without_its_eyes(
     path: Path,
 ) -> None:
-    agent, config, _ = load_policy(path)
+    agent, config, _ = load_agent(path)
 
     def blindfolded(state: dict[str, Tensor]) -> Tensor:
         return agent.policy(state | {"images": torch.zeros_like(state["images"])})

@@ -74,6 +74,6 @@ def test_a_shipped_policy_has_its_figures_and_origin(tmp_path, monkeypatch, sent
     if sentences > 1:
         assert data["same_scene"]["scenes"] == 10
         assert data["same_scene"]["exclusive"] == 0.9
-    agent, _, facts = checkpoint.load_policy(stem.with_suffix(".safetensors"))
+    agent, _, facts = checkpoint.load_agent(stem.with_suffix(".safetensors"))
     assert facts["evaluation"]["commit"] == "0" * 40 and facts["steps"] == 4096
     assert agent.policy(STATE).tolist() == data["acts"], "another one was evaluated"

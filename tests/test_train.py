@@ -93,7 +93,7 @@ def test_training_learns_the_toy_task_and_keeps_the_best_policy(tmp_path):
     assert float(rows(tmp_path, "evaluations")[-1]["eval/worst"]) == 1.0
     report = json.loads((tmp_path / "evaluation.json").read_text())
     assert (report["episodes"], report["overall"]["success"]) == (16, 1.0)
-    _, stored, metadata = checkpoint.load_policy(best)
+    _, stored, metadata = checkpoint.load_agent(best)
     assert stored == config
     assert metadata["evaluation"] == report
 
@@ -363,7 +363,7 @@ def test_a_broken_checkpoint_is_refused(tmp_path):
 
 def test_a_folder_that_cannot_be_written_is_refused_before_training(tmp_path):
     (tmp_path / "file").write_text("not a folder")
-    with pytest.raises(CheckpointError, match=r"cannot write to .*choose another"):
+    with pytest.raises(OSError, match=r"cannot write .*choose another"):
         run(toy_config(tmp_path / "file" / "run"))
 
 

@@ -12,7 +12,12 @@ from . import facts
 from .facts import Frames
 from .shapes import Section, Surface, join, loft
 
-Color = IntEnum("Color", "WHITE SHELL GREY DARK BLACK ORANGE CYAN GLOW", start=0)
+
+class Color(IntEnum):
+    """A swatch of the palette."""
+
+    WHITE, SHELL, GREY, DARK, BLACK, ORANGE, CYAN, GLOW = range(8)
+
 
 PALETTE = (
     (246, 247, 249),  # WHITE: the shell

@@ -2,18 +2,17 @@
 
 Both kinds of file are safetensors with a JSON header: a *checkpoint* is complete
 (weights, optimizer, random states), a *policy* holds only the weights that act, with 16
-bits each. Either opens with `load_policy`, and tells for which task, words and robot it
-was trained.
+bits each. Either tells for which task, words and robot it was trained.
 """
 
-import contextlib
 import dataclasses
 import json
 import random
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import metadata as packages
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 import numpy as np
@@ -25,11 +24,11 @@ from torch import Tensor
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.agent.agent import Agent, StateSpec
-from ir_maniskill.environment.robots.robot import short_name
 from ir_maniskill.experiment import Experiment
 from ir_maniskill.files import replacing
+from ir_maniskill.training.algorithm import under
 from ir_maniskill.training.config import TrainConfig, from_data, to_data
-from ir_maniskill.training.finite import check_finite
+from ir_maniskill.training.finite import check_finite, not_finite
 
 CHECKPOINT, POLICY = "checkpoint", "policy"
 """The kinds of file."""
@@ -48,7 +47,7 @@ MALFORMED = (
 
 
 class CheckpointError(RuntimeError):
-    """A file that cannot be used, or written: what was got, what is expected."""
+    """A file or folder that cannot be used: what was got, what is expected."""
 
 
 class MismatchError(ValueError):
@@ -74,39 +73,15 @@ def write(path: Path, stored: Stored) -> None:
     """Write the file so that a crash leaves either the old one or the new one.
 
     Raises:
-        CheckpointError: If it cannot be written; the file there before is untouched.
+        OSError: If it cannot be written; the file there before is untouched.
         TrainingDivergedError: If a number in it is not finite; likewise.
     """
     tensors = {k: v.detach().cpu().contiguous() for k, v in stored.tensors.items()}
     check_finite(tensors, "checkpoint", "the learning rate is too high")
     kind = f"ir_maniskill {stored.kind} {FORMAT}"
     header = {"kind": kind, "metadata": json.dumps(stored.metadata)}
-    replace(path, format_tensors(tensors, header))
-
-
-def replace(path: Path, data: bytes) -> None:
-    """Put `data` in place of the file, or leave the file as it is if that fails.
-
-    Raises:
-        CheckpointError: If it cannot be written; the file there before is untouched.
-    """
-    try:
-        with replacing(path) as aside:
-            aside.write_bytes(data)
-    except OSError as error:
-        raise CheckpointError(str(error)) from error
-
-
-@contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Turn whatever keeps `path` from being written into one clear error."""
-    try:
-        yield
-    except OSError as error:
-        raise CheckpointError(
-            f"cannot write {path}: {error.strerror}; free some space or choose another "
-            "folder (what was saved before is intact)"
-        ) from error
+    with replacing(path) as aside:
+        aside.write_bytes(format_tensors(tensors, header))
 
 
 def read(path: Path) -> Stored:
@@ -133,32 +108,21 @@ def read(path: Path) -> Stored:
         stored = Stored(kind, parse_tensors(path.read_bytes()), metadata)
         if int(version) == 1:
             stored = _from_version_1(stored)
-        _require_finite(stored.tensors)
+        if broken := not_finite(stored.tensors):
+            raise ValueError(f"{', '.join(broken)} is not finite")
         return stored
+    except CheckpointError:
+        raise
     except OSError as error:
         raise CheckpointError(
             f"cannot read {path}: {error.strerror or error}"
         ) from error
-    except CheckpointError:
-        raise
     except MALFORMED as error:
         raise CheckpointError(
             f"{path}: got a file that is cut short, altered or not ours "
-            f"({_brief(error)}); expected a checkpoint or policy of ir_maniskill: "
-            "restore it, or train anew"
+            f"({shorten(str(error), 300)}); expected a checkpoint or policy of "
+            "ir_maniskill: restore it, or train anew"
         ) from error
-
-
-def _require_finite(tensors: Mapping[str, Tensor]) -> None:
-    for name, tensor in tensors.items():
-        if tensor.is_floating_point() and not tensor.isfinite().all():
-            raise ValueError(f"{name} is not finite")
-
-
-def _brief(error: Exception) -> str:
-    """Return the message in one line of bearable length."""
-    line = " ".join(str(error).split())
-    return line if len(line) < 300 else line[:300] + "..."
 
 
 # -- Files of 0.1 ----------------------------------------------------------------------
@@ -182,11 +146,8 @@ def _from_version_1(stored: Stored) -> Stored:
         "touch": [frames, fingers],
     }
     if old["cameras"]:
-        shapes["images"] = [
-            frames,
-            *(old[k] for k in ("cameras", "height", "width")),
-            3,
-        ]
+        cameras = [old[name] for name in ("cameras", "height", "width")]
+        shapes["images"] = [frames, *cameras, 3]
     if old["privileged"]:
         shapes["privileged"] = [old["privileged"]]
     metadata["spec"] = {"shapes": shapes, "actions": old["actions"]}
@@ -216,10 +177,7 @@ def _dequantized(stored: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def describe(agent: Agent, config: TrainConfig, **facts: object) -> dict[str, Any]:
-    """Return the metadata that every file carries.
-
-    Words, the longest sentence and the robot are in the config.
-    """
+    """Return the metadata of every file; words and robot are in the config."""
     resolved = dataclasses.replace(config, agent=agent.config)
     known = config.env_id in catalog.available()
     return {
@@ -241,14 +199,9 @@ def save_policy(
     steps: int,
     evaluation: Mapping[str, Any],
 ) -> None:
-    """Write the weights that act, with where they come from and how good they are.
+    """Write the weights that act, and how the agent was trained.
 
-    Args:
-        path: File to write.
-        agent: The learner.
-        config: How it was trained.
-        steps: Environment steps it was trained for.
-        evaluation: Figures of its evaluation, plain data.
+    Beside them stand the environment `steps` that took, and its figures as plain data.
     """
     learned = dict(agent.named_parameters())
     weights = {  # what is counted or measured keeps all its bits
@@ -260,7 +213,7 @@ def save_policy(
     write(path, Stored(POLICY, weights, facts))
 
 
-def load_policy(path: Path | str) -> tuple[Agent, TrainConfig, dict[str, Any]]:
+def load_agent(path: Path | str) -> tuple[Agent, TrainConfig, dict[str, Any]]:
     """Return the agent of a policy or checkpoint file, its config and its metadata.
 
     The agent of a policy file has no critic: use `agent.policy`.
@@ -269,38 +222,25 @@ def load_policy(path: Path | str) -> tuple[Agent, TrainConfig, dict[str, Any]]:
         CheckpointError: If the file is none of ours, or does not fit its own config.
     """
     stored = read(Path(path))
+    complete = stored.kind == CHECKPOINT
+    weights = under("agent", stored.tensors) if complete else stored.tensors
     try:
         config = from_data(stored.metadata["config"])
         spec = StateSpec.from_data(stored.metadata["spec"])
-        agent = _agent(config, spec, stored)
+        # Sizes that the file claims take no memory before they are known to be right.
+        with torch.device("meta"):
+            agent = Agent(config.agent, spec, policy_only=not complete)
+        weights = {
+            k: v.float() if v.is_floating_point() else v for k, v in weights.items()
+        }
+        agent.load_state_dict(weights, assign=True)
     except MALFORMED as error:
         raise CheckpointError(
             f"{path}: its weights and its config do not belong together "
-            f"({_brief(error)}); expected a file of this version of ir_maniskill"
+            f"({shorten(str(error), 300)}); expected a file of this version of "
+            "ir_maniskill"
         ) from error
     return agent.eval(), config, stored.metadata
-
-
-def _agent(config: TrainConfig, spec: StateSpec, stored: Stored) -> Agent:
-    """Return the agent with the stored weights.
-
-    Sizes that the file claims take no memory before they are known to be right.
-    """
-    complete = stored.kind == CHECKPOINT
-    weights = {
-        name.removeprefix("agent."): weight.float()
-        if weight.is_floating_point()
-        else weight
-        for name, weight in stored.tensors.items()
-        if name.startswith("agent.") or not complete
-    }
-    with torch.device("meta"):
-        agent = Agent(config.agent, spec, policy_only=not complete)
-    agent.load_state_dict(weights, assign=True)
-    return agent
-
-
-# -- What a policy was trained for -----------------------------------------------------
 
 
 def task_facts(experiment: Experiment) -> dict[str, Any]:
@@ -321,55 +261,6 @@ def _plain(value: Any) -> Any:
         if (found := getattr(value, field.name)) != field.default
     }
     return {"is": type(value).__name__, **unusual}
-
-
-def require_match(
-    config: TrainConfig,
-    metadata: Mapping[str, Any],
-    experiment: Experiment,
-    robot: str | None = None,
-    *,
-    any_task: bool = False,
-) -> None:
-    """Raise unless a policy can do the task with the robot.
-
-    Args:
-        config: How it was trained, and
-        metadata: what its file says, both of `load_policy`.
-        experiment: The task.
-        robot: What `robot_uids` takes; None: not told, or the policy's own.
-        any_task: Accept another task, if it has the same words.
-
-    Raises:
-        MismatchError: Naming all that is different.
-    """
-    words = config.agent.vocabulary
-    pairs: dict[str, tuple[Any, Any]] = {}
-    if words != experiment.vocabulary:
-        pairs["vocabulary"] = words, experiment.vocabulary
-    if robot is not None and short_name(robot) != short_name(config.robot):
-        pairs["robot"] = config.robot, robot
-    if not any_task:
-        if config.env_id != experiment.id:
-            pairs["task"] = config.env_id, experiment.id
-        else:
-            then, now = metadata.get("task", {}), task_facts(experiment)
-            pairs |= {k: (then[k], now.get(k)) for k in then if then[k] != now.get(k)}
-    if pairs:
-        told = (_difference(name, *pair) for name, pair in pairs.items())
-        raise MismatchError(
-            f"policy trained for {config.env_id} does not fit {experiment.id}: "
-            + "; ".join(told)
-        )
-
-
-def _difference(name: str, got: Any, expected: Any) -> str:
-    """Return what differs; of long lists only the first place that does."""
-    lists = isinstance(got, list | tuple) and isinstance(expected, list | tuple)
-    if lists and len(got) == len(expected):
-        place = next(i for i, item in enumerate(got) if item != expected[i])
-        name, got, expected = f"{name}[{place}]", got[place], expected[place]
-    return f"{name}: got {got!r}, expected {expected!r}"
 
 
 # -- Random generators -----------------------------------------------------------------

@@ -16,6 +16,7 @@ from typing import Any
 from torch.utils.tensorboard import SummaryWriter
 
 from ir_maniskill.checks import ConfigError
+from ir_maniskill.files import replacing, require_writable, writing
 from ir_maniskill.training import checkpoint
 from ir_maniskill.training.checkpoint import CheckpointError, Stored
 from ir_maniskill.training.config import TrainConfig, from_data, to_json
@@ -33,8 +34,9 @@ class RunFolder:
         """Make or enter the folder, and hold it until `close`.
 
         Raises:
-            CheckpointError: If another training is using it, it holds a run that would
-                be overwritten, or it cannot be written to.
+            CheckpointError: If another training is using it, or it holds a run that
+                would be overwritten.
+            OSError: If it cannot be written to.
         """
         self.path = path
         self.last = path / "last.safetensors"
@@ -52,27 +54,18 @@ class RunFolder:
 
     def _enter(self) -> None:
         """Take the folder for this process alone, and see that it can be written to."""
+        require_writable(self.path / ".probe")
+        self._lock = os.open(self.path, os.O_RDONLY)
         try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            probe = self.path / ".probe"
-            probe.write_bytes(b"0")
-            probe.unlink()
-            folder = os.open(self.path, os.O_RDONLY)
-        except OSError as error:
-            raise CheckpointError(
-                f"cannot write to {self.path}: {error.strerror}; choose another folder"
-            ) from error
-        try:
-            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            os.close(folder)
+            self.close()
             raise CheckpointError(
                 f"{self.path} is in use by another training; wait until it ends, or "
                 "choose another folder"
             ) from None
         except OSError:
             log.warning("%s: cannot be locked; train there only once", self.path)
-        self._lock = folder
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what other ranks get: the places, but no hold on the folder."""
@@ -104,8 +97,7 @@ class RunFolder:
             for leftover in self.path.glob(pattern):
                 leftover.unlink()
         self._events = SummaryWriter(str(self.path), purge_step=steps + 1)
-        text = to_json(config) + "\n"
-        checkpoint.replace(self.path / "config.json", text.encode())
+        self.write("config.json", (to_json(config) + "\n").encode())
         self._cut("metrics", steps)
         return self._cut("evaluations", steps)
 
@@ -115,12 +107,13 @@ class RunFolder:
         if not table.exists():
             return 0
         rows = [row for row in whole_rows(table) if int(row["steps"]) <= steps]
-        checkpoint.replace(table, _format(rows, header=True))
+        self.write(table.name, _format(rows, header=True))
         return int(rows[-1]["steps"]) if rows else 0
 
-    def save(self, snapshot: Stored) -> None:
-        """Write the newest checkpoint in place of the one before."""
-        checkpoint.write(self.last, snapshot)
+    def write(self, name: str, data: bytes) -> None:
+        """Put `data` in place of a file of the folder, or leave that as it is."""
+        with replacing(self.path / name) as aside:
+            aside.write_bytes(data)
 
     def save_at_last(self, snapshot: Stored) -> None:
         """Write the checkpoint of a run that has to stop."""
@@ -133,7 +126,7 @@ class RunFolder:
     def log(self, table: str, steps: int, figures: Mapping[str, float]) -> None:
         """Add a row to the CSV table, and a point to every TensorBoard curve."""
         path = self.path / f"{table}.csv"
-        with checkpoint.writing(path), path.open("ab") as file:
+        with writing(path), path.open("ab") as file:
             row = {"steps": steps, **figures}
             file.write(_format([row], header=file.tell() == 0))
             for name, value in figures.items():

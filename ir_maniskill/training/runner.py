@@ -197,14 +197,13 @@ class Runner:
 
     def confirm(self) -> None:
         """Evaluate the best policy on other scenes than those it was chosen by."""
-        agent, _, metadata = checkpoint.load_policy(self.folder.best)
+        agent, _, metadata = checkpoint.load_agent(self.folder.best)
         sentences = len(self.envs.experiment.sentences)
         episodes = max(FINAL_EPISODES, sentences)
         report = self._report(agent.to(self.device), episodes, FINAL_SEED)
         figures = self._keep(agent, metadata["steps"], report)
-        text = json.dumps(figures, indent=2)
-        path = self.folder.path / "evaluation.json"
-        checkpoint.replace(path, (text + "\n").encode())
+        text = json.dumps(figures, indent=2) + "\n"
+        self.folder.write("evaluation.json", text.encode())
 
     def _report(self, agent: Agent, episodes: int, seed: int) -> EvaluationReport:
         """Evaluate an agent without holding what training goes on with."""
@@ -255,7 +254,7 @@ class Runner:
 
     def _write(self) -> None:
         """Write the first rank's newest snapshot as the last checkpoint."""
-        distributed.from_first(lambda: self.folder.save(self.newest))
+        distributed.from_first(lambda: checkpoint.write(self.folder.last, self.newest))
 
     @contextlib.contextmanager
     def _kept_at_last(self) -> Iterator[None]:

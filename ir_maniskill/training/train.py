@@ -63,6 +63,7 @@ def train(
         ConfigError: If the run was begun with another config, the envs cannot be shared
             evenly among the ranks, those given are others than the config says, or an
             evaluation has too few episodes.
+        OSError: If the folder cannot be written to.
         RankError: If another rank failed.
         TrainingDivergedError: If a number stopped being finite.
         WorkerError: If a simulator process died or hangs.
