@@ -1,4 +1,4 @@
-"""Checks of configuration values, and the error that they raise."""
+"""Checks of what is given, and the errors that they raise: got, expected, available."""
 
 import typing
 from typing import Any
@@ -8,13 +8,29 @@ class ConfigError(ValueError):
     """A configuration value that cannot be used: what was got, what is expected."""
 
 
-def require(condition: bool, name: str, got: object, expected: str) -> None:
-    """Raise ConfigError unless the condition holds."""
+def require(
+    condition: bool,
+    name: str,
+    got: object,
+    expected: str,
+    error: type[Exception] = ConfigError,
+) -> None:
+    """Raise the error unless the condition holds."""
     if not condition:
-        raise ConfigError(f"{name}: got {got!r}, expected {expected}")
+        raise error(f"{name}: got {got!r}, expected {expected}")
 
 
-def require_choice(name: str, got: str, annotation: Any) -> None:
-    """Raise ConfigError unless the value is one of a Literal type."""
-    choices = typing.get_args(annotation)
-    require(got in choices, name, got, "one of " + ", ".join(map(repr, choices)))
+def require_choice(
+    name: str, got: object, choices: Any, error: type[Exception] = ConfigError
+) -> None:
+    """Raise the error unless the value is one of the choices, maybe a Literal type."""
+    available = typing.get_args(choices) or tuple(choices)
+    if got not in available:
+        raise error(f"{name}: got {got!r}, available: {', '.join(available)}")
+
+
+def require_type(
+    name: str, got: object, kind: type, error: type[Exception] = ConfigError
+) -> None:
+    """Raise the error unless the value is of that type."""
+    require(isinstance(got, kind), name, got, f"a {kind.__name__}", error)

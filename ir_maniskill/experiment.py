@@ -16,12 +16,13 @@ import sys
 import unicodedata
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from numbers import Integral, Real
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import torch
 
+from ir_maniskill import checks
 from ir_maniskill.goals import COLORS, SHAPES, Goal, GoalError, Ref, Touch
 from ir_maniskill.snapshot import Snapshot
 
@@ -66,9 +67,18 @@ class UnknownExperimentError(KeyError):
         return str(self.args[0])
 
 
+_require = partial(checks.require, error=ExperimentError)
+_require_choice = partial(checks.require_choice, error=ExperimentError)
+_require_type = partial(checks.require_type, error=ExperimentError)
+
+
 @dataclass(frozen=True)
 class TouchObject:
-    """A thing on the table that a finger can touch."""
+    """A thing on the table that a finger can touch.
+
+    Raises:
+        ExperimentError: The color, shape or place is not one we can build.
+    """
 
     color: str
     """A key of `COLORS`."""
@@ -78,19 +88,12 @@ class TouchObject:
     """One of `SHAPES`."""
 
     def __post_init__(self) -> None:
-        """Check the fields.
-
-        Raises:
-            ExperimentError: The color, shape or place is not one we can build.
-        """
-        _check_choice("object color", self.color, COLORS)
-        _check_choice("object shape", self.shape, SHAPES)
-        _check_tuple(f"position of the {self.name}", self.position, Real)
-        if len(self.position) != 2 or not all(map(math.isfinite, self.position)):
-            raise ExperimentError(
-                f"position of the {self.name}: got {self.position!r}, "
-                "expected two finite numbers (x, y) in meters"
-            )
+        _require_choice("object color", self.color, COLORS)
+        _require_choice("object shape", self.shape, SHAPES)
+        what, expected = f"position of the {self.name}", "two finite numbers (x, y) [m]"
+        _require_tuple(what, self.position, Real)
+        finite = len(self.position) == 2 and all(map(math.isfinite, self.position))
+        _require(finite, what, self.position, expected)
 
     @property
     def name(self) -> str:
@@ -108,13 +111,8 @@ class Instruction:
     """What it asks for, e.g. `Touch(Ref("blue", "cube"))`."""
 
     def __post_init__(self) -> None:
-        """Check the fields.
-
-        Raises:
-            ExperimentError: One has another type.
-        """
-        _check_type("instruction text", self.text, str)
-        _check_type("instruction goal", self.goal, Goal)
+        _require_type("instruction text", self.text, str)
+        _require_type("instruction goal", self.goal, Goal)
 
 
 @dataclass(frozen=True)
@@ -132,13 +130,8 @@ class Jitter:
     """Of each actuated joint about its start [rad]."""
 
     def __post_init__(self) -> None:
-        """Check the fields.
-
-        Raises:
-            ExperimentError: A half-width is negative or too large to be safe.
-        """
         for name, largest in (("position", 0.05), ("yaw", math.pi), ("joints", 0.3)):
-            _check_number(f"jitter.{name}", getattr(self, name), 0, largest)
+            _require_number(f"jitter.{name}", getattr(self, name), 0, largest)
 
 
 RewardKind = Literal["binary", "per_finger"]
@@ -146,7 +139,11 @@ RewardKind = Literal["binary", "per_finger"]
 
 @dataclass(frozen=True)
 class Experiment:
-    """One experiment of the Environment block (paper, Sec. III-A and IV)."""
+    """One experiment of the Environment block (paper, Sec. III-A and IV).
+
+    Raises:
+        ExperimentError: Some field is malformed; the message says which.
+    """
 
     id: str
     """Id for `gym.make`, e.g. "NaoTouchCubeSingle-v1"."""
@@ -172,22 +169,19 @@ class Experiment:
     sentences if left out."""
 
     def __post_init__(self) -> None:
-        """Check that the experiment can be built and said.
-
-        Raises:
-            ExperimentError: Some field is malformed; the message says which.
-        """
-        _check_id(self.id)
-        _check_choice("reward", self.reward, get_args(RewardKind))
-        _check_number("wrong_penalty", self.wrong_penalty, 0, 10)
-        _check_number("episode_steps", self.episode_steps, 1, 10_000, Integral)
-        _check_type("jitter", self.jitter, Jitter)
-        _check_type("shuffled", self.shuffled, bool)
-        _check_tuple("senses", self.senses, str)
+        form = r"\w[\w-]*-v\d+"
+        valid = isinstance(self.id, str) and re.fullmatch(form, self.id, re.ASCII)
+        _require(bool(valid), "experiment id", self.id, 'a form like "MyTask-v1"')
+        _require_choice("reward", self.reward, RewardKind)
+        _require_number("wrong_penalty", self.wrong_penalty, 0, 10)
+        _require_number("episode_steps", self.episode_steps, 1, 10_000, Integral)
+        _require_type("jitter", self.jitter, Jitter)
+        _require_type("shuffled", self.shuffled, bool)
+        _require_tuple("senses", self.senses, str)
         for sense in self.senses:
-            _check_choice("sense", sense, SENSES)
-        _check_tuple("objects", self.objects, TouchObject)
-        _check_tuple("instructions", self.instructions, Instruction)
+            _require_choice("sense", sense, SENSES)
+        _require_tuple("objects", self.objects, TouchObject)
+        _require_tuple("instructions", self.instructions, Instruction)
         if self.vocabulary == ():
             object.__setattr__(self, "vocabulary", words_of(self.sentences))
         self._check_vocabulary()
@@ -202,42 +196,32 @@ class Experiment:
         return tuple(instruction.text for instruction in self.instructions)
 
     def _check_vocabulary(self) -> None:
-        _check_tuple("vocabulary", self.vocabulary, str)
-        if self.vocabulary[:2] != VOCABULARY[:2]:
-            raise ExperimentError(
-                f"vocabulary: got {self.vocabulary[:2]!r} as its first two tokens, "
-                f"expected {VOCABULARY[:2]!r}"
-            )
+        _require_tuple("vocabulary", self.vocabulary, str)
+        first, expected = self.vocabulary[:2], f"{VOCABULARY[:2]} as its first tokens"
+        _require(first == VOCABULARY[:2], "vocabulary", first, expected)
+        expected = "words in lower case and full stops, no two alike"
         for index, word in enumerate(self.vocabulary[2:], start=2):
-            if tokenize(word, self.vocabulary) != [index]:
-                raise ExperimentError(
-                    f"vocabulary: got {word!r}, expected words in lower case and "
-                    "full stops, no two alike"
-                )
+            itself = tokenize(word, self.vocabulary) == [index]
+            _require(itself, "vocabulary", word, expected)
 
     def _check_instructions(self) -> None:
         names = [thing.name for thing in self.objects]
-        if len(set(names)) != len(names) or not names:
-            raise ExperimentError(
-                f"objects: got {names}, expected at least one and no two alike"
-            )
-        if not self.instructions:
-            raise ExperimentError("instructions: got none, expected at least one")
+        distinct = 0 < len(names) == len(set(names))
+        _require(distinct, "objects", names, "at least one and no two alike")
+        _require(self.instructions != (), "instructions", (), "at least one")
         said: dict[tuple[int, ...], Instruction] = {}
         for instruction in self.instructions:
+            text = instruction.text
             self._check_refs(instruction)
-            tokens = tuple(tokenize(instruction.text, self.vocabulary))
-            if not tokens:
-                raise ExperimentError(
-                    f"instruction text: got {instruction.text!r}, an empty sentence"
-                )
+            tokens = tuple(tokenize(text, self.vocabulary))
+            _require(tokens != (), "instruction text", text, "a word or full stop")
             other = said.setdefault(tokens, instruction)
-            if other.goal != instruction.goal:
-                raise ExperimentError(
-                    f"instructions: got {other.text!r} and {instruction.text!r}, which "
-                    f"are the same to the vocabulary {self.vocabulary}; expected it to "
-                    "have the words that tell their goals apart"
-                )
+            _require(
+                other.goal == instruction.goal,
+                f"instructions that are the same to the vocabulary {self.vocabulary}",
+                (other.text, text),
+                "it to have the words that tell their goals apart",
+            )
 
     def _check_refs(self, instruction: Instruction) -> None:
         """Raise unless each reference fits one object, as far as the layout says."""
@@ -245,12 +229,12 @@ class Experiment:
         for ref in instruction.goal.refs:
             fits = int(ref.resolve(layout).sum())
             unknown = self.shuffled and ref.where is not None  # told at each reset
-            if fits != 1 and not unknown:
-                names = ", ".join(thing.name for thing in self.objects)
-                raise ExperimentError(
-                    f"instruction {instruction.text!r}: got {ref}, which fits {fits} "
-                    f"of the objects, expected exactly one of: {names}"
-                )
+            _require(
+                fits == 1 or unknown,
+                f"instruction {instruction.text!r}: objects that {ref} fits",
+                fits,
+                "exactly one of: " + ", ".join(thing.name for thing in self.objects),
+            )
 
     def _check_layout(self) -> None:
         slack = self.jitter.position * math.sqrt(2)
@@ -273,11 +257,9 @@ class Experiment:
 
 
 def tokenize(sentence: str, vocabulary: tuple[str, ...] = VOCABULARY) -> list[int]:
-    """Split a sentence into words and full stops and return their ids.
+    """Return the ids of a sentence's words and full stops: places in the vocabulary.
 
-    Args:
-        sentence: Any text; case does not matter, unknown words become `<unk>`.
-        vocabulary: The known tokens; an id is a place in it.
+    Case does not matter, unknown words become `<unk>`.
     """
     ids = {word: index for index, word in enumerate(vocabulary)}
     return [ids.get(word, UNK) for word in split_words(sentence)]
@@ -344,21 +326,18 @@ def add(experiment: Experiment) -> None:
     Raises:
         ExperimentError: Another experiment has that id already.
     """
-    known = _CATALOG.get(experiment.id)
-    if known is not None and known != experiment:
+    if _CATALOG.setdefault(experiment.id, experiment) != experiment:
         raise ExperimentError(
             f"experiment id: got {experiment.id!r}, which is taken; "
             "register yours under another id"
         )
-    _CATALOG[experiment.id] = experiment
 
 
 def get(experiment_id: str) -> Experiment:
     """Return the experiment of that id.
 
-    Args:
-        experiment_id: The id; with "MODULE:" before it the module, one in the current
-            folder too, is imported first, so that it can register its tasks.
+    With "MODULE:" before it the module, one in the current folder too, is imported
+    first, so that it can register its tasks.
 
     Raises:
         ExperimentError: The module cannot be imported.
@@ -393,33 +372,13 @@ def available() -> tuple[str, ...]:
     return tuple(_CATALOG)
 
 
-def _check_choice(what: str, got: Any, choices: Iterable[str]) -> None:
-    if got not in (available := tuple(choices)):
-        raise ExperimentError(f"{what}: got {got!r}, available: {', '.join(available)}")
-
-
-def _check_number(
+def _require_number(
     what: str, got: Any, low: float, high: float, kind: type = Real
 ) -> None:
-    if not (isinstance(got, kind) and low <= got <= high):  # type: ignore[operator]
-        raise ExperimentError(f"{what}: got {got!r}, expected {low} to {high}")
+    valid = isinstance(got, kind) and low <= got <= high  # type: ignore[operator]
+    _require(valid, what, got, f"{low} to {high}")
 
 
-def _check_type(what: str, got: Any, kind: type) -> None:
-    if not isinstance(got, kind):
-        raise ExperimentError(f"{what}: got {got!r}, expected a {kind.__name__}")
-
-
-def _check_tuple(what: str, got: Any, kind: type) -> None:
-    if not (isinstance(got, tuple) and all(isinstance(item, kind) for item in got)):
-        raise ExperimentError(f"{what}: got {got!r}, expected ({kind.__name__}, ...)")
-
-
-def _check_id(experiment_id: Any) -> None:
-    form = r"\w[\w-]*-v\d+"
-    if not (
-        isinstance(experiment_id, str) and re.fullmatch(form, experiment_id, re.ASCII)
-    ):
-        raise ExperimentError(
-            f'experiment id: got {experiment_id!r}, expected a form like "MyTask-v1"'
-        )
+def _require_tuple(what: str, got: Any, kind: type) -> None:
+    valid = isinstance(got, tuple) and all(isinstance(item, kind) for item in got)
+    _require(valid, what, got, f"({kind.__name__}, ...)")

@@ -22,14 +22,15 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
 from dataclasses import dataclass, fields
+from functools import partial
 from numbers import Real
 from types import SimpleNamespace
 
 import torch
 from torch import Tensor
 
+from ir_maniskill import checks
 from ir_maniskill.snapshot import Snapshot
 
 COLORS: dict[str, tuple[float, float, float]] = {
@@ -71,9 +72,8 @@ class GoalError(ValueError):
     """A goal or reference is malformed, or does not fit its scene."""
 
 
-def _require_choice(what: str, got: object, choices: Iterable[str]) -> None:
-    if got not in (available := tuple(choices)):
-        raise GoalError(f"{what}: got {got!r}, available: {', '.join(available)}")
+_require_choice = partial(checks.require_choice, error=GoalError)
+_require_type = partial(checks.require_type, error=GoalError)
 
 
 # -- References ------------------------------------------------------------------------
@@ -89,10 +89,8 @@ class Relation:
     """The other object."""
 
     def __post_init__(self) -> None:
-        """Check the fields."""
         _require_choice("relation", self.kind, RELATIONS)
-        if not isinstance(self.ref, Ref):
-            raise GoalError(f"{self.kind}: got {self.ref!r}, expected a Ref")
+        _require_type(self.kind, self.ref, Ref)
 
     def fits(self, scene: Snapshot) -> Tensor:
         """Return which objects are so [N, C] bool."""
@@ -104,19 +102,12 @@ class Relation:
         return y > at if self.kind == "left_of" else y < at
 
 
-def left_of(ref: Ref) -> Relation:
-    """Return the relation "left of the ..."."""
-    return Relation("left_of", ref)
-
-
-def right_of(ref: Ref) -> Relation:
-    """Return the relation "right of the ..."."""
-    return Relation("right_of", ref)
-
-
-def other_than(ref: Ref) -> Relation:
-    """Return the relation "the one that is not the ..."."""
-    return Relation("other_than", ref)
+left_of = partial(Relation, "left_of")
+"""The relation "left of the ...", of its `Ref`."""
+right_of = partial(Relation, "right_of")
+"""The relation "right of the ...", of its `Ref`."""
+other_than = partial(Relation, "other_than")
+"""The relation "the one that is not the ...", of its `Ref`."""
 
 
 @dataclass(frozen=True)
@@ -124,6 +115,9 @@ class Ref:
     """Says which object is meant; in its scene it must fit exactly one.
 
     It is resolved when an episode begins: what was leftmost then is meant to the end.
+
+    Raises:
+        GoalError: There is no such color, shape or relation.
     """
 
     color: str | None = None
@@ -134,11 +128,6 @@ class Ref:
     """A key of `EXTREMES`, or a relation such as `left_of(Ref("red"))`; None: any."""
 
     def __post_init__(self) -> None:
-        """Check the fields.
-
-        Raises:
-            GoalError: There is no such color, shape or relation.
-        """
         if self.color is not None:
             _require_choice("color of a Ref", self.color, COLORS)
         if self.shape is not None:
@@ -188,7 +177,6 @@ class Measure:
     """How many goals of a sequence `Then` are reached [N] int64; None: 0."""
 
     def __post_init__(self) -> None:
-        """Put in what was left out."""
         objects = self.serves[:, 0]  # [N, C]
         defaults = {
             "bars": lambda: torch.zeros_like(self.serves),
@@ -204,16 +192,12 @@ class Measure:
     @staticmethod
     def where(chosen: Tensor, first: Measure, second: Measure) -> Measure:
         """Return the first measure in the scenes chosen [N] bool, else the second."""
-        pairs = {
-            f.name: (getattr(first, f.name), getattr(second, f.name))
-            for f in fields(Measure)
-        }
-        return Measure(
-            **{
-                name: torch.where(chosen.view(-1, *[1] * (a.ndim - 1)), a, b)
-                for name, (a, b) in pairs.items()
-            }
-        )
+
+        def pick(name: str) -> Tensor:
+            a, b = getattr(first, name), getattr(second, name)
+            return torch.where(chosen.view(-1, *[1] * (a.ndim - 1)), a, b)
+
+        return Measure(**{name: pick(name) for name in vars(first)})
 
 
 # -- Goals -----------------------------------------------------------------------------
@@ -249,20 +233,12 @@ class Goal(ABC):
 
     def _check(self, **kinds: type) -> None:
         for name, kind in kinds.items():
-            if not isinstance(got := getattr(self, name), kind):
-                raise GoalError(
-                    f"{name} of {type(self).__name__}: got {got!r}, "
-                    f"expected a {kind.__name__}"
-                )
+            what = f"{name} of {type(self).__name__}"
+            _require_type(what, getattr(self, name), kind)
 
 
 def nearest(scene: Snapshot, serves: Tensor) -> Tensor:
-    """Return the distance from the nearest fingertip that may touch [N] [m].
-
-    Args:
-        scene: The scenes.
-        serves: Which finger may touch which object [N, F, C] bool.
-    """
+    """Return how near a fingertip is to what it may touch [N, F, C] bool: [N] [m]."""
     return scene.distance.where(serves, torch.inf).flatten(1).amin(dim=1)
 
 
@@ -276,7 +252,6 @@ class Touch(Goal):
     """With which of the robot's hands; None: any."""
 
     def __post_init__(self) -> None:
-        """Check the fields."""
         self._check(ref=Ref)
 
     @staticmethod
@@ -304,7 +279,6 @@ class Push(Goal):
     """Largest share of the way that it may stray to the side."""
 
     def __post_init__(self) -> None:
-        """Check the fields."""
         self._check(ref=Ref, distance=Real)
         _require_choice("direction of Push", self.direction, DIRECTIONS)
         if not 0 < self.distance <= 0.5:
@@ -332,7 +306,6 @@ class Avoid(Goal):
     """Which object."""
 
     def __post_init__(self) -> None:
-        """Check the fields."""
         self._check(ref=Ref)
 
     @staticmethod
@@ -355,7 +328,6 @@ class Both(Goal):
     """The other."""
 
     def __post_init__(self) -> None:
-        """Check the fields."""
         self._check(a=Goal, b=Goal)
         if any(map(_is_sequence, self.parts)):
             raise GoalError("Both: got a Then in it, expected a Then around it")
@@ -385,7 +357,6 @@ class Then(Goal):
     """The second; it may be a sequence."""
 
     def __post_init__(self) -> None:
-        """Check the fields."""
         self._check(a=Goal, b=Goal)
         if _is_sequence(self.a):
             raise GoalError("Then: got a Then as `a`, expected it as `b`")

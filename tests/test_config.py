@@ -56,7 +56,7 @@ def test_a_budget_scales_all_that_follows_the_steps():
         ({"control_mode": "pd_ee"}, "control_mode: got 'pd_ee'.*'pd_joint_pos'"),
         (
             {"reward_weights": vars(RewardWeights()) | {"after_foul": 1.5}},
-            "reward_weights: got after_foul=1.5",
+            "reward_weights.after_foul: got 1.5",
         ),
         ({"schema": 3}, "schema: got 3, expected 1 to 2"),
     ],

@@ -101,10 +101,16 @@ def test_an_id_of_another_package_is_taken(task_id: str) -> None:
         ({"wrong_penalty": -1.0}, "wrong_penalty: got -1.0"),
         ({"episode_steps": 0}, "episode_steps: got 0"),
         ({"senses": ("smell",)}, "sense: got 'smell'"),
-        ({"instructions": ()}, "instructions: got none"),
-        ({"instructions": (Instruction("Go.", PINK),)}, "which fits 0 of the objects"),
-        ({"instructions": (Instruction("Go.", CUBE),)}, "which fits 2 of the objects"),
-        ({"instructions": (Instruction(" ", SOUND),)}, "an empty sentence"),
+        ({"instructions": ()}, r"instructions: got \(\), expected at least one"),
+        (
+            {"instructions": (Instruction("Go.", PINK),)},
+            "fits: got 0, expected exactly",
+        ),
+        (
+            {"instructions": (Instruction("Go.", CUBE),)},
+            "fits: got 2, expected exactly",
+        ),
+        ({"instructions": (Instruction(" ", SOUND),)}, "got ' ', expected a word"),
         ({"objects": ()}, "at least one"),
         ({"objects": (BLUE, BLUE)}, "no two alike"),
         ({"vocabulary": ("touch", "the")}, "vocabulary: got"),
@@ -112,7 +118,7 @@ def test_an_id_of_another_package_is_taken(task_id: str) -> None:
         ({"vocabulary": (*VOCABULARY, "cube")}, "got 'cube', .* no two alike"),
         ({"vocabulary": "touch"}, r"vocabulary: got 'touch', expected \(str, ...\)"),
         ({"objects": [BLUE]}, r"expected \(TouchObject, ...\)"),
-        ({"instructions": (Instruction("?!", SOUND),)}, "'\\?!', an empty"),
+        ({"instructions": (Instruction("?!", SOUND),)}, "got '\\?!', expected a word"),
         ({"shuffled": "no"}, "shuffled: got 'no', expected a bool"),
         ({"jitter": 0.01}, "jitter: got 0.01, expected a Jitter"),
         ({"wrong_penalty": "1"}, "wrong_penalty: got '1', expected 0 to 10"),
@@ -281,6 +287,6 @@ def test_a_relation_in_shuffled_places_is_left_to_the_reset() -> None:
     make(instructions=(left,))
     green = TouchObject("green", (0.20, -0.10))
     two = Instruction("Touch that.", Touch(Ref(where=other_than(Ref("blue")))))
-    with pytest.raises(ExperimentError, match="fits 2 of the objects"):
+    with pytest.raises(ExperimentError, match="fits: got 2, expected exactly"):
         make(objects=(BLUE, RED, green), instructions=(two,))
     make(objects=(BLUE, RED, green), instructions=(two,), shuffled=True)

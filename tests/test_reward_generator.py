@@ -120,5 +120,7 @@ def test_weights_have_their_signs_and_their_highest():
     "change", [{"hold": -1.0}, {"foul": math.inf}, {"after_foul": 1.1}]
 )
 def test_weights_that_cannot_work_are_refused(change):
-    with pytest.raises(ValueError, match="reward_weights: got .* expected a finite"):
+    with pytest.raises(
+        ValueError, match=r"reward_weights\.\w+: got .* expected a finite"
+    ):
         RewardWeights(**change)

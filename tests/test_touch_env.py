@@ -211,7 +211,7 @@ def test_pictures_that_a_shader_pack_cannot_draw_are_refused() -> None:
     [
         ({"num_envs": 2, "sim_backend": "physx_cpu"}, "got 2, .*make_vec"),
         ({"experiment": None}, "experiment: got None, expected an Experiment or its"),
-        ({"reward_weights": {"hold": -1}}, "reward_weights: got hold=-1"),
+        ({"reward_weights": {"hold": -1}}, "reward_weights.hold: got -1"),
     ],
 )
 def test_arguments_that_cannot_work_are_refused(wrong: dict, message: str) -> None:

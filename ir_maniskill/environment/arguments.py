@@ -13,8 +13,8 @@ from torch import Tensor
 RESET_OPTIONS = ("instruction", "reconfigure", "reset_to_env_states")
 """Names of the options that a reset of all envs takes."""
 
-HIGHEST_SEED = 2**32 - 1
-"""Of NumPy's random streams, from which ManiSkill draws."""
+SEEDS = range(2**32)
+"""Seeds of NumPy's random streams, from which ManiSkill draws."""
 
 
 def seeds_of(seed: int | Sequence[int], num_envs: int) -> list[int]:
@@ -25,28 +25,18 @@ def seeds_of(seed: int | Sequence[int], num_envs: int) -> list[int]:
     """
     given = _plain(seed)
     seeds = [given + row for row in range(num_envs)] if _whole(given) else given
-    valid = isinstance(seeds, list) and all(map(_whole, seeds))
-    if (
-        valid
-        and len(seeds) == num_envs
-        and 0 <= min(seeds) <= max(seeds) <= HIGHEST_SEED
-    ):
+    if isinstance(seeds, list) and len(seeds) == num_envs and _all_in(SEEDS, seeds):
         return seeds
     raise ValueError(
         f"seed: got {short(given)}, expected an integer (env i gets seed + i) or "
-        f"{num_envs} of them, so that each env's is from 0 to {HIGHEST_SEED}"
+        f"{num_envs} of them, so that each env's is from 0 to {SEEDS[-1]}"
     )
 
 
 def instruction_indices(
     given: Any, sentences: Sequence[str], num_envs: int
 ) -> list[int]:
-    """Return the index of each env's sentence.
-
-    Args:
-        given: An index or a sentence for all envs, or N of them.
-        sentences: Those that there are.
-        num_envs: Number of envs N.
+    """Return the index of each env's sentence: one, or its text, for all, or N of them.
 
     Raises:
         ValueError: It is something else, or there is no such sentence.
@@ -54,8 +44,7 @@ def instruction_indices(
     given = _plain(given)
     each = given if isinstance(given, list) else [given] * num_envs
     indices = [sentences.index(one) if one in sentences else one for one in each]
-    valid = len(indices) == num_envs and all(map(_whole, indices))
-    if valid and 0 <= min(indices) <= max(indices) < len(sentences):
+    if len(indices) == num_envs and _all_in(range(len(sentences)), indices):
         return indices
     raise ValueError(
         f"reset option 'instruction': got {short(given)}, expected an index from 0 to "
@@ -69,11 +58,8 @@ def options_of(
 ) -> list[dict[str, Any]]:
     """Return the reset options of each of N envs.
 
-    Args:
-        options: "instruction" as for `instruction_indices`; "reconfigure" is a bool for
-            all envs; "reset_to_env_states" holds trees or arrays of N rows or of one.
-        sentences: Those that there are.
-        num_envs: Number of envs N.
+    "instruction" is as for `instruction_indices`, "reconfigure" a bool for all envs;
+    "reset_to_env_states" holds trees or arrays of N rows or of one.
 
     Raises:
         ValueError: There is another option, or a value cannot be used.
@@ -155,3 +141,7 @@ def _plain(given: Any) -> Any:
 
 def _whole(given: Any) -> bool:
     return isinstance(given, int) and not isinstance(given, bool)
+
+
+def _all_in(numbers: range, given: list) -> bool:
+    return all(_whole(one) and one in numbers for one in given)

@@ -7,6 +7,7 @@ impulse query. Legend: N envs, F fingers, C objects.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -24,13 +25,7 @@ def touch_sensor(
     fingers: Sequence[Sequence[Link]],
     objects: Sequence[Actor],
 ) -> CpuTouchSensor | GpuTouchSensor:
-    """Return the sensor for the backend that `scene` runs on.
-
-    Args:
-        scene: The ManiSkill scene, set up.
-        fingers: The links of each finger.
-        objects: What they may touch.
-    """
+    """Return the sensor for the backend that `scene`, which is set up, runs on."""
     kind = GpuTouchSensor if scene.gpu_sim_enabled else CpuTouchSensor
     return kind(scene, fingers, objects)
 
@@ -44,14 +39,13 @@ class CpuTouchSensor:
         fingers: Sequence[Sequence[Link]],
         objects: Sequence[Actor],
     ) -> None:
-        """Remember which two bodies are which finger and object."""
+        """Take the links of each finger, and what they may touch."""
         self._system = scene.px
         self._place: dict[tuple, tuple[int, int, int]] = {}
         for f, links in enumerate(fingers):
-            for c, actor in enumerate(objects):
-                for link in links:
-                    pair = link._bodies[0], actor._bodies[0]
-                    self._place[pair] = self._place[pair[::-1]] = (0, f, c)
+            for link, (c, actor) in itertools.product(links, enumerate(objects)):
+                pair = link._bodies[0], actor._bodies[0]
+                self._place[pair] = self._place[pair[::-1]] = (0, f, c)
         self._shape = (1, len(fingers), len(objects))
         self._touched: set[tuple[int, int, int]] = set()
 
@@ -90,7 +84,7 @@ class GpuTouchSensor:
         fingers: Sequence[Sequence[Link]],
         objects: Sequence[Actor],
     ) -> None:
-        """Create the impulse query, pairs ordered (link, object, env)."""
+        """Create the impulse query of all pairs, ordered (link, object, env)."""
         self._system = scene.px
         links = [link for finger in fingers for link in finger]
         pairs = [

@@ -25,37 +25,26 @@ Deal = Callable[[Tensor, Tensor, Snapshot], Any]
 
 
 class InstructionalSet:
-    """The instructions of one experiment as tensors.
+    """The instructions of one experiment as tensors, the shorter sentences padded.
 
-    Attributes:
-        sentences: The I sentences.
-        tokens: Token ids, padded with 0 to the longest sentence [I, L] int64.
-        text: The sentences in UTF-8, padded likewise [I, B] uint8.
-        goals: The I goals, ready to be measured.
+    `tokens` are their ids [I, L] int64, `text` is UTF-8 [I, B] uint8; `hands` says
+    which fingers belong to each of the robot's hands [F] bool.
+
+    Raises:
+        GoalError: A goal asks for a hand that the robot does not have.
     """
 
     def __init__(
         self, experiment: Experiment, hands: Mapping[str, Tensor], device: torch.device
     ) -> None:
-        """Put the sentences and goals of `experiment` onto `device`.
-
-        Args:
-            experiment: Whose instructions.
-            hands: Which fingers belong to each of the robot's hands [F] bool.
-            device: Of all tensors.
-
-        Raises:
-            GoalError: A goal asks for a hand that the robot does not have.
-        """
-        self.sentences = experiment.sentences
-        self.tokens = tokens_of(self.sentences, experiment.vocabulary).to(device)
-        self.text = text_of(self.sentences).to(device)
+        sentences = experiment.sentences
+        self.tokens = tokens_of(sentences, experiment.vocabulary).to(device)
+        self.text = text_of(sentences).to(device)
         goals = [instruction.goal for instruction in experiment.instructions]
         self.goals = GoalTable(goals, hands, device)
 
     def __len__(self) -> int:
-        """Return the number of instructions I."""
-        return len(self.sentences)
+        return len(self.tokens)
 
     def pick(self, uniform: Tensor) -> Tensor:
         """Map uniform numbers in [0, 1) to instruction indices [N] int64."""
@@ -79,46 +68,33 @@ class GoalBatch:
 
 
 class GoalTable:
-    """Goals as columns of tensors, to be dealt to any batch of scenes."""
+    """Goals as columns of tensors, by kind, to be dealt to any batch of scenes.
+
+    Raises:
+        GoalError: A field has a value that cannot be stacked.
+    """
 
     def __init__(
         self, goals: Sequence[Goal], hands: Mapping[str, Tensor], device: torch.device
     ) -> None:
-        """Sort the goals by kind and stack their fields.
-
-        Args:
-            goals: The goals.
-            hands: Which fingers belong to each hand [F] bool.
-            device: Of all tensors.
-
-        Raises:
-            GoalError: A field has a value that cannot be stacked.
-        """
         self.kinds = list(dict.fromkeys(type(goal) for goal in goals))
         place = [self.kinds.index(type(goal)) for goal in goals]
         row = [place[:index].count(kind) for index, kind in enumerate(place)]
         self._kind = torch.tensor(place, device=device)  # [I] place in `kinds`
         self._row = torch.tensor(row, device=device)  # [I] row among its kind
-        self._columns: list[dict[str, Deal]] = [
-            {
-                field.name: _column(
-                    field.name, [getattr(goal, field.name) for goal in alike], hands
-                )
-                for field in fields(kind)
-            }
-            for kind in self.kinds
-            for alike in [[goal for goal in goals if type(goal) is kind]]
-        ]
+        self._columns: list[dict[str, Deal]] = []
+        for kind in self.kinds:
+            alike = [goal for goal in goals if type(goal) is kind]
+            names = [field.name for field in fields(kind)]
+            values = {name: [getattr(goal, name) for goal in alike] for name in names}
+            self._columns.append({n: _column(n, v, hands) for n, v in values.items()})
 
     def deal(
         self, index: Tensor, scene: Snapshot, counts: Tensor | None = None
     ) -> GoalBatch:
-        """Give each scene the goal of an index, its references resolved there.
+        """Give each scene the goal of an index [N], its references resolved there.
 
-        Args:
-            index: Which goal [N] int64.
-            scene: The scenes.
-            counts: Which rows are asked at all [N] bool; None: all.
+        `counts` says which rows are asked at all [N] bool; None: all.
 
         Raises:
             GoalError: A reference does not fit exactly one object.

@@ -48,10 +48,10 @@ class WorkerError(RuntimeError):
 
 
 class ProcessVectorEnv(VectorEnv):
-    """N envs on the CPU, spread evenly over worker processes.
+    """N envs on the CPU, spread evenly over worker processes; `make_vec` makes one.
 
-    Scripts that make one must guard their entry with `if __name__ == "__main__":`,
-    as always with processes that are not forked.
+    Scripts that do so must guard their entry with `if __name__ == "__main__":`, as
+    always with processes that are not forked.
     """
 
     device = torch.device("cpu")
@@ -61,26 +61,11 @@ class ProcessVectorEnv(VectorEnv):
         self,
         experiment: Experiment,
         num_envs: int,
-        *,
         num_workers: int | None = None,
         env_kwargs: dict[str, Any] | None = None,
         timeout: float = 180.0,
     ) -> None:
-        """Start the workers and make their envs.
-
-        Args:
-            experiment: What to make; sent to the workers, so that one registered by
-                a user's script is known to them too.
-            num_envs: Number of envs N.
-            num_workers: Number of processes; None is one per core.
-            env_kwargs: Passed to `gym.make`.
-            timeout: How long a worker may take for one command [s].
-
-        Raises:
-            WorkerError: Processes cannot be started from here, or a worker could not
-                make its envs.
-            OSError: There is too little shared memory.
-        """
+        """Start the workers and make their envs; the arguments are `make_vec`'s."""
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
         cores = len(os.sched_getaffinity(0))
         workers = min(num_envs, num_workers or cores)
@@ -108,10 +93,7 @@ class ProcessVectorEnv(VectorEnv):
             try:
                 ours, theirs = context.Pipe()
                 process = context.Process(
-                    target=work,
-                    args=(theirs, dict(os.environ)),
-                    name=name,
-                    daemon=True,
+                    target=work, args=(theirs, dict(os.environ)), name=name, daemon=True
                 )
                 process.start()
             except OSError as error:
@@ -145,10 +127,7 @@ class ProcessVectorEnv(VectorEnv):
     # -- VectorEnv -------------------------------------------------------------------
 
     def reset(
-        self,
-        *,
-        seed: int | Sequence[int] | None = None,
-        options: dict[str, Any] | None = None,
+        self, *, seed: int | Sequence[int] | None = None, options: dict | None = None
     ) -> tuple[Observation, Tree]:
         """Start a new episode in every env.
 
@@ -161,8 +140,7 @@ class ProcessVectorEnv(VectorEnv):
 
         Raises:
             ValueError: A seed or an option cannot be used; no env has been reset.
-            WorkerError: A worker failed (another reset may do), died or hangs, or has
-                not answered the last command.
+            WorkerError: A worker failed (another reset may do), died or hangs.
         """
         options = options or {}
         if "env_idx" in options:
@@ -181,19 +159,13 @@ class ProcessVectorEnv(VectorEnv):
         return self._shared.read("obs"), self._shared.read("info")
 
     def step(self, actions: Tensor | np.ndarray) -> Step:
-        """Step every env and reset those that are done.
+        """Step every env by its row of actions [N, J], and reset those that are done.
 
-        Args:
-            actions: One row per env [N, J] in [-1, 1].
-
-        Returns:
-            Observation, reward [N], terminated [N], truncated [N] and info. Where an
-            episode ends, info has what `final_infos` says of it.
+        Where an episode ends, info has what `final_infos` says of it.
 
         Raises:
             ValueError: The actions have another shape or are not finite.
-            WorkerError: A worker failed, died or hangs, or has not answered the last
-                command.
+            WorkerError: A worker failed, died or hangs.
         """
         self.step_async(actions)
         return self.step_wait()
@@ -219,20 +191,15 @@ class ProcessVectorEnv(VectorEnv):
         return obs, reward, terminated, truncated, info
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple:
-        """Call the method of every env, or get the attribute, of this name.
-
-        Returns:
-            N results, copied from the workers.
+        """Call the method of every env, or get the attribute: N results, copied.
 
         Raises:
             ValueError: All envs have one method of that name, which is to be used.
             WorkerError: There is none, it failed, or its result cannot be copied; or
-                a worker died or hangs, or has not answered the last command.
+                a worker died or hangs.
         """
         if name in ("reset", "step", "close"):
-            raise ValueError(
-                f"call: got {name!r}, which is to be used for all: {name}()"
-            )
+            raise ValueError(f"call: got {name!r}; use {name}() of all envs")
         answers = self._command("call", [(name, args, kwargs)] * len(self._pipes))
         return tuple(result for answer in answers for result in answer)
 
@@ -282,31 +249,28 @@ class ProcessVectorEnv(VectorEnv):
 
     def _gather(self) -> list:
         """Collect one answer from every worker."""
-        answers: dict[int, bytes] = {}
+        answers: list[bytes] = [b""] * len(self._pipes)
+        asked: dict[Any, int] = {pipe: i for i, pipe in enumerate(self._pipes)}
         left = self._timeout
-        while len(answers) < len(self._pipes):
-            asked: dict[Any, int] = {
-                p: i for i, p in enumerate(self._pipes) if i not in answers
-            }
+        while asked:
             ready = wait(list(asked), min(left, 1.0))
             # No clock: an hour in which all were stopped (Ctrl-Z) counts as a second.
             left -= 0.0 if ready else 1.0
             if left <= 0:
                 names = ", ".join(map(self._describe, asked.values()))
                 raise WorkerError(f"no answer within {self._timeout:g} s from {names}")
-            for pipe in [pipe for pipe in asked if pipe in ready]:
+            for pipe in ready:
+                index = asked.pop(pipe)
                 try:
-                    answers[asked[pipe]] = pipe.recv_bytes()
+                    answers[index] = self._pipes[index].recv_bytes()
                 except (EOFError, OSError):
-                    raise self._died(asked[pipe]) from None
+                    raise self._died(index) from None
         self._busy = False
-        results = []
-        for index in range(len(self._pipes)):
-            done, result = pickle.loads(answers[index])
+        results = [pickle.loads(answer) for answer in answers]
+        for index, (done, result) in enumerate(results):
             if not done:
                 raise WorkerError(f"{self._describe(index)} failed:\n{result}")
-            results.append(result)
-        return results
+        return [result for _, result in results]
 
     def _describe(self, index: int) -> str:
         rows = self._rows[index]
@@ -326,14 +290,9 @@ class ProcessVectorEnv(VectorEnv):
 def final_infos(obs: Observation, info: Tree, done: Tensor) -> Tree:
     """Return what info says of ended episodes, under Gymnasium's and ManiSkill's names.
 
-    Args:
-        obs: Last observations of the episodes.
-        info: Their last infos.
-        done: Whose episode has ended [N] bool; rows of the others are set to zero.
-
-    Returns:
-        `final_obs` and `final_observation` (the same tensors), `final_info`, and `done`
-        under each of these names with "_" before it.
+    These are `final_obs` and `final_observation` (the same tensors) and `final_info`,
+    and `done` [N] bool under each of them with "_" before it. Rows of envs whose
+    episode goes on are set to zero.
     """
     going = (~done).nonzero()[:, 0]
     for tree in (obs, info):

@@ -6,12 +6,13 @@ Legend: N envs, F fingers, C objects, K reward terms.
 
 from __future__ import annotations
 
-import math
+import sys
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from ir_maniskill.checks import require
 from ir_maniskill.experiment import Experiment
 from ir_maniskill.goals import MOVED, Measure
 from ir_maniskill.snapshot import Snapshot
@@ -82,11 +83,7 @@ def reward_terms(
 ) -> Tensor:
     """Return the terms of the dense reward, which is ours [N, K], as in `TERMS`.
 
-    Args:
-        scene: The scenes.
-        measure: Their goals.
-        verdict: What their contacts mean.
-        fouled: Whether there has been a foul in the episode, this step's too [N] bool.
+    `fouled` says whether there was a foul in the episode, this step's too [N] bool.
     """
     clean, fouled = (~fouled).float(), fouled.float()
     each = scene.distance.where(measure.serves, torch.inf).amin(dim=2)  # [N, F]
@@ -107,7 +104,7 @@ def reward_terms(
 
 @dataclass(frozen=True)
 class RewardWeights:
-    """Weights of the dense reward's terms."""
+    """Weights of the dense reward's terms, each finite and at least 0."""
 
     hold: float = 1.0
     """Of the goal's level: for a touch, of each finger."""
@@ -125,18 +122,10 @@ class RewardWeights:
     a goal worth reaching without one."""
 
     def __post_init__(self) -> None:
-        """Check the fields.
-
-        Raises:
-            ValueError: A weight is negative or not finite, or a share is more than 1.
-        """
         for name, value in vars(self).items():
-            high = 1 if name == "after_foul" else math.inf
-            if not (0 <= value <= high and math.isfinite(value)):
-                raise ValueError(
-                    f"reward_weights: got {name}={value!r}, expected a finite number "
-                    "of at least 0 (after_foul: at most 1)"
-                )
+            most = 1 if name == "after_foul" else sys.float_info.max
+            expected = "a finite number of at least 0 (after_foul: at most 1)"
+            require(0 <= value <= most, f"reward_weights.{name}", value, expected)
 
     def vector(self) -> Tensor:
         """Return the weight of each of `TERMS`, penalties with their sign [K]."""

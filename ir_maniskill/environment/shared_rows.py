@@ -26,8 +26,7 @@ FOLDER = Path("/dev/shm")
 class SharedRows:
     """One record for each of N envs, in memory that several processes map.
 
-    Attributes:
-        views: The records' fields, as nested dicts of arrays [N, ...].
+    `views` are the records' fields, as nested dicts of arrays [N, ...].
     """
 
     def __init__(self, descriptor: int, record: np.dtype, num_envs: int) -> None:

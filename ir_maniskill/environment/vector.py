@@ -17,12 +17,9 @@ from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 from torch import Tensor
 
 from ir_maniskill import experiment as catalog
+from ir_maniskill.checks import require
 from ir_maniskill.environment.arguments import RESET_OPTIONS, require_names, seeds_of
-from ir_maniskill.environment.process_vector import (
-    ProcessVectorEnv,
-    Step,
-    final_infos,
-)
+from ir_maniskill.environment.process_vector import ProcessVectorEnv, Step, final_infos
 
 
 def make_vec(
@@ -54,35 +51,22 @@ def make_vec(
     """
     experiment = catalog.get(task_id)
     for name, number in (("num_envs", num_envs), ("num_workers", num_workers)):
-        if number is not None and number < 1:
-            raise ValueError(f"{name}: got {number}, expected at least 1")
+        require(number is None or number >= 1, name, number, "at least 1")
     if sim_backend == "auto":
         sim_backend = "physx_cuda" if torch.cuda.is_available() else "physx_cpu"
     if _simulator(sim_backend) == "physx_cuda":
-        if not torch.cuda.is_available():
-            raise ValueError(
-                f"sim_backend: got {sim_backend!r}, expected 'physx_cpu': torch sees "
-                "no CUDA device here"
-            )
+        expected = "'physx_cpu': torch sees no CUDA device here"
+        require(torch.cuda.is_available(), "sim_backend", sim_backend, expected)
         return GpuVectorEnv(task_id, num_envs, sim_backend=sim_backend, **env_kwargs)
-    return ProcessVectorEnv(
-        experiment,
-        num_envs,
-        num_workers=num_workers,
-        env_kwargs=env_kwargs,
-        timeout=timeout,
-    )
+    return ProcessVectorEnv(experiment, num_envs, num_workers, env_kwargs, timeout)
 
 
 def _simulator(sim_backend: str) -> str:
     """Return the first of ManiSkill's names of a backend, without the device."""
     kind, _, _ = sim_backend.partition(":")
-    if kind not in sim_backend_name_mapping:
-        raise ValueError(
-            f"sim_backend: got {sim_backend!r}, expected 'auto' or one of "
-            f"{', '.join(sim_backend_name_mapping)}, with a device if need be "
-            "('cuda:0')"
-        )
+    known = ", ".join(sim_backend_name_mapping)
+    expected = f"'auto' or one of {known}, with a device if need be ('cuda:0')"
+    require(kind in sim_backend_name_mapping, "sim_backend", sim_backend, expected)
     return sim_backend_name_mapping[kind]
 
 
@@ -101,12 +85,7 @@ class GpuVectorEnv(ManiSkillVectorEnv):
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict | None = None
     ) -> tuple[dict, dict]:
-        """Start a new episode in all envs, or in b of them.
-
-        Args:
-            seed: Env i gets seed + i, or the i-th of a list of N; None goes on with
-                each env's own random stream.
-            options: As for `TouchEnv.reset`, and "env_idx": which envs to reset [b].
+        """Start a new episode in all envs, or in those of the option "env_idx" [b].
 
         Raises:
             ValueError: An option or a seed cannot be used, or a seed comes with
@@ -114,18 +93,18 @@ class GpuVectorEnv(ManiSkillVectorEnv):
         """
         options = dict(options or {})
         require_names(options, (*RESET_OPTIONS, "env_idx"))
-        if seed is not None and "env_idx" in options:
-            raise ValueError(
-                f"seed: got {seed} for some of the envs, expected None with the option "
-                "'env_idx'; leave 'env_idx' out to seed all envs"
-            )
         if "env_idx" in options:
+            if seed is not None:
+                raise ValueError(
+                    f"seed: got {seed} for some of the envs, expected None with the "
+                    "option 'env_idx'; leave 'env_idx' out to seed all envs"
+                )
             options["env_idx"] = torch.as_tensor(options["env_idx"], device=self.device)
         seeds = None if seed is None else seeds_of(seed, self.num_envs)
         return super().reset(seed=seeds, options=options)
 
     def step(self, actions: Any) -> Step:
-        """Step all envs and reset those that are done."""
+        """Step all envs and reset those that are done, as `ProcessVectorEnv` does."""
         obs, reward, terminated, truncated, info = super().step(actions)
         if "final_info" in info:
             obs_then, info_then = info["final_observation"], info["final_info"]
