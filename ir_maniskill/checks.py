@@ -1,7 +1,8 @@
 """Checks of configuration values, and the error that they raise."""
 
 import typing
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Literal
 
 
 class ConfigError(ValueError):
@@ -14,7 +15,20 @@ def require(condition: bool, name: str, got: object, expected: str) -> None:
         raise ConfigError(f"{name}: got {got!r}, expected {expected}")
 
 
-def require_choice(name: str, got: str, annotation: Any) -> None:
-    """Raise ConfigError unless the value is one of a Literal type."""
-    choices = typing.get_args(annotation)
-    require(got in choices, name, got, "one of " + ", ".join(map(repr, choices)))
+def require_fields(
+    config: object, names: str, fits: Callable[[Any], bool], expected: str
+) -> None:
+    """Raise ConfigError unless each of the fields, named side by side, fits."""
+    for name in names.split():
+        value = getattr(config, name)
+        require(fits(value), name, value, expected)
+
+
+def require_choices(config: object) -> None:
+    """Raise ConfigError unless the fields of Literal types have one of their values."""
+    for name, hint in typing.get_type_hints(type(config)).items():
+        if typing.get_origin(hint) is Literal:
+            got, choices = getattr(config, name), typing.get_args(hint)
+            require(
+                got in choices, name, got, "one of " + ", ".join(map(repr, choices))
+            )

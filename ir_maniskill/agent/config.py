@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from ir_maniskill.checks import require, require_choice
+from ir_maniskill.checks import require, require_choices, require_fields
 from ir_maniskill.environment.senses import available
 from ir_maniskill.experiment import VOCABULARY
 
@@ -59,15 +59,13 @@ class AgentConfig:
             known = ", ".join(map(repr, available()))
             require(sense in available(), "senses", sense, f"one of {known}")
         require(self.senses != (), "senses", self.senses, "at least one, or None")
-        require_choice("vision", self.vision, Vision)
-        require_choice("critic", self.critic, CriticInput)
-        length, words = self.language_length, self.vocabulary
-        require(length > 0, "language_length", length, "at least 1")
+        require_choices(self)
+        words, units = self.vocabulary, self.hidden
         require(len(words) > 1, "vocabulary", words, "<pad>, <unk> and words")
-        fits = 1 <= len(self.hidden) <= 100 and min(self.hidden) > 0
-        require(fits, "hidden", self.hidden, "1 to 100 positive sizes")
-        weight = self.auxiliary_weight
-        require(weight >= 0, "auxiliary_weight", weight, "0 or more")
+        fits = 1 <= len(units) <= 100 and min(units) > 0
+        require(fits, "hidden", units, "1 to 100 positive sizes")
+        require_fields(self, "language_length", lambda x: x > 0, "at least 1")
+        require_fields(self, "auxiliary_weight", lambda x: x >= 0, "0 or more")
         gain, senses = self.posture_gain, self.senses
         fits = 0 <= gain < math.inf
         require(fits, "posture_gain", gain, "a finite number of at least 0")

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from ir_maniskill.agent.agent import asks
 from ir_maniskill.agent.config import AgentConfig, from_version_1, without_constants
-from ir_maniskill.checks import ConfigError, require, require_choice
+from ir_maniskill.checks import ConfigError, require, require_choices, require_fields
 from ir_maniskill.environment.reward_generator import RewardWeights
 
 ControlMode = Literal["pd_joint_target_delta_pos", "pd_joint_pos"]
@@ -34,8 +34,7 @@ class PPOConfig:
     """Proximal policy optimization."""
 
     steps_per_update: int = 2048
-    """Steps collected for each update, over all envs and ranks; rounded up to whole
-    steps of all envs."""
+    """Steps of each update, over all envs and ranks; rounded up to steps of all."""
     epochs: int = 5
     """Passes over the collected steps, at most."""
     minibatch: int | None = 256
@@ -52,9 +51,8 @@ class PPOConfig:
     """Largest change of an action's probability ratio that is rewarded."""
     target_kl: float | None = 0.015
     """How far an epoch should find the policy moved [nat]: Adam's step size shrinks
-    where it is twice as far, to 1e-5 at least, and grows where it is half, to 1e-3 at
-    most; where it is more than three times as far no epoch follows. None: the step
-    size stays, and all epochs are made."""
+    where it is twice as far, and grows where it is half; where it is more than three
+    times as far no epoch follows. None: the step size stays, all epochs are made."""
     max_grad_norm: float | None = 0.5
     """Longest gradient; None: any."""
     std: float = 1.0
@@ -64,20 +62,15 @@ class PPOConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
-        for name in ("steps_per_update", "epochs"):
-            require(getattr(self, name) > 0, name, getattr(self, name), "at least 1")
+        require_fields(self, "steps_per_update epochs", lambda x: x > 0, "at least 1")
         batch, total = self.minibatch, self.steps_per_update
         fits = batch is None or 2 <= batch <= total
         require(fits, "minibatch", batch, f"2 to {total} steps, or None")
-        for name in ("gamma", "gae_lambda"):
-            value = getattr(self, name)
-            require(0 <= value <= 1, name, value, "0 to 1")
-        for name in ("learning_rate", "clip", "std", "std_final"):
-            value = getattr(self, name)
-            require(0 < value < math.inf, name, value, "more than 0, and finite")
-        for name in ("target_kl", "max_grad_norm"):
-            value = getattr(self, name)
-            require(value is None or value > 0, name, value, "more than 0, or None")
+        require_fields(self, "gamma gae_lambda", lambda x: 0 <= x <= 1, "0 to 1")
+        above, expected = "learning_rate clip std std_final", "more than 0, and finite"
+        require_fields(self, above, lambda x: 0 < x < math.inf, expected)
+        above, expected = "target_kl max_grad_norm", "more than 0, or None"
+        require_fields(self, above, lambda x: x is None or x > 0, expected)
 
 
 @dataclass(frozen=True)
@@ -97,15 +90,13 @@ class TrainConfig:
     num_envs: int = 16
     """Scenes simulated side by side, over all ranks."""
     sim_backend: SimBackend = "physx_cpu"
-    """Where physics is computed: "physx_cpu" has worker processes on the cores,
-    "physx_cuda" all envs in one batch on the GPU."""
+    """Physics: worker processes on the cores, or all envs in a batch on the GPU."""
     render_backend: RenderBackend = "auto"
     """What draws: "auto" is a GPU if there is one, "cpu" the cores, through Mesa."""
     num_workers: int | None = None
     """Simulator processes of each rank on the CPU; None: one a core."""
     threads: int | None = None
-    """Threads of each rank's update; None: one a core, or one alone where waiting
-    threads would keep cores busy (OMP_WAIT_POLICY was not passive when torch began)."""
+    """Threads of each rank's update; None: as `distributed.threads` says."""
     control_mode: ControlMode = "pd_joint_target_delta_pos"
     """What an action means: "pd_joint_target_delta_pos" moves the joint targets,
     "pd_joint_pos" sets them (the paper's)."""
@@ -114,11 +105,9 @@ class TrainConfig:
     reward_weights: RewardWeights = field(default_factory=RewardWeights)
     """What counts how much in the dense reward."""
     penalty_warmup: float = 1 / 3
-    """Share of the training over which the dense reward's penalties grow from nothing
-    to what they are: first to reach the goal, then to reach it without a foul."""
+    """Share of the training over which the dense reward's penalties grow from 0."""
     shader_pack: str | None = "unlit"
-    """Shader pack of the cameras: "unlit" paints base colors and is by far the
-    cheapest, "minimal" and "default" are lit; None: the task's own."""
+    """Shader pack of the cameras: "unlit" is the cheapest; None: the task's own."""
     camera_height: int = 64
     """Height of each image [pixel]."""
     camera_width: int = 32
@@ -138,18 +127,12 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
+        require_choices(self)
         positive = "total_steps num_envs num_workers threads camera_height camera_width"
         positive += " frames eval_interval eval_episodes checkpoint_interval"
-        for name in positive.split():
-            value = getattr(self, name)
-            require(value is None or value > 0, name, value, "at least 1")
-        warmup = self.penalty_warmup
-        require(0 <= warmup <= 1, "penalty_warmup", warmup, "0 to 1")
-        require_choice("sim_backend", self.sim_backend, SimBackend)
-        require_choice("render_backend", self.render_backend, RenderBackend)
-        require_choice("control_mode", self.control_mode, ControlMode)
-        require_choice("reward_mode", self.reward_mode, RewardMode)
-        require(0 <= self.seed < 2**31, "seed", self.seed, "0 to 2**31 - 1")
+        require_fields(self, positive, lambda x: x is None or x > 0, "at least 1")
+        require_fields(self, "penalty_warmup", lambda x: 0 <= x <= 1, "0 to 1")
+        require_fields(self, "seed", lambda x: 0 <= x < 2**31, "0 to 2**31 - 1")
         gain = self.agent.posture_gain
         fits = gain == 0 or self.control_mode == "pd_joint_target_delta_pos"
         expected = "0 where actions do not change the joint targets (control_mode)"
@@ -252,8 +235,8 @@ def from_data(data: object) -> TrainConfig:
     """Return the configuration from plain data of this version or an earlier one.
 
     Raises:
-        ConfigError: If a field is unknown, missing, of another type than declared, or
-            out of its range, or a later version of the package wrote it.
+        ConfigError: If a field is unknown, missing, of another type or out of its
+            range, or a later version of the package wrote it.
     """
     config: TrainConfig = _decode(TrainConfig, migrate(data), "TrainConfig")
     return config
@@ -327,8 +310,7 @@ def _decode(hint: Any, value: Any, name: str) -> Any:
         require(isinstance(value, list | tuple), name, value, "a list")
         return tuple(_decode(arguments[0], item, name) for item in value)
     if origin is Literal:
-        require_choice(name, value, hint)
-        return value
+        return value  # its class refuses others
     if hint is float and type(value) is int:
         return float(value)
     require(type(value) is hint, name, value, f"a value of type {hint.__name__}")
@@ -353,12 +335,9 @@ def _decode_fields(cls: type, data: Any) -> Any:
 
 
 def resumed(stored: TrainConfig, given: TrainConfig) -> TrainConfig:
-    """Return the config with which a run goes on: its own, but for what may change.
+    """Return a run's own config, but for what may change and is given.
 
-    Given counts what differs from `TrainConfig()`.
-
-    Raises:
-        ConfigError: If something else is given that differs from the run's config.
+    Given counts what differs from `TrainConfig()`. ConfigError: it may not change.
     """
     usual = leaves(TrainConfig())
     told = {k: v for k, v in leaves(given).items() if v != usual[k] or k == "out"}

@@ -100,23 +100,16 @@ class Rollout:
             self.frames.add(t, state["images"], self.done[t - 1])
 
     def add_outcome(self, t: int, reward: Tensor, done: Tensor, beyond: Tensor) -> None:
-        """Keep what step t led to.
+        """Keep what step t led to, all [N].
 
-        Args:
-            t: The step.
-            reward: r_t [N].
-            done: Whether the episode ended with this step [N].
-            beyond: Value of the last state of an ended episode, else 0 [N].
+        `done` are episodes that ended, `beyond` is the value of their last states.
         """
         self.reward[t], self.done[t], self.next_value[t] = reward, done, beyond
 
     def finish(self, last_value: Tensor, gamma: float, gae_lambda: float) -> None:
         """Turn rewards and values into advantages and returns.
 
-        Args:
-            last_value: Value of the states after the last step [N].
-            gamma: Discount.
-            gae_lambda: Decay of the advantage estimate.
+        `last_value` [N] is that of the states after the last step.
         """
         following = torch.cat([self.value[1:], last_value[None]])
         self.next_value = torch.where(self.done, self.next_value, following)

@@ -72,19 +72,13 @@ class RunFolder:
         return {**vars(self), "_lock": None, "_events": None}
 
     def read_last(self) -> Stored | None:
-        """Return the last checkpoint, if there is one.
-
-        Raises:
-            CheckpointError: If it is broken, or no complete checkpoint.
-        """
+        """Return the last checkpoint, if any; CheckpointError: it is broken."""
         if not self.last.exists():
             return None
         stored = checkpoint.read(self.last)
         if stored.kind != checkpoint.CHECKPOINT:
-            raise CheckpointError(
-                f"{self.last}: got a policy, expected a complete checkpoint to resume "
-                "from"
-            )
+            expected = "expected a complete checkpoint to resume from"
+            raise CheckpointError(f"{self.last}: got a policy, {expected}")
         return stored
 
     def begin(self, config: TrainConfig, steps: int) -> int:
@@ -119,9 +113,8 @@ class RunFolder:
         """Write the checkpoint of a run that has to stop."""
         with _undisturbed():
             checkpoint.write(self.last, snapshot)
-        log.warning(
-            "stopped at step %d: resume goes on there", snapshot.metadata["steps"]
-        )
+        steps = snapshot.metadata["steps"]
+        log.warning("stopped at step %d: resume goes on there", steps)
 
     def log(self, table: str, steps: int, figures: Mapping[str, float]) -> None:
         """Add a row to the CSV table, and a point to every TensorBoard curve."""
@@ -158,11 +151,7 @@ def _undisturbed() -> Iterator[None]:
 
 
 def stored_config(folder: Path) -> TrainConfig | None:
-    """Return the config of the run in a folder; None if there is no run.
-
-    Raises:
-        ConfigError: If it is none.
-    """
+    """Return the config of the run in a folder, if any; ConfigError: it is broken."""
     path = folder / "config.json"
     if not path.exists():
         return None
