@@ -28,7 +28,6 @@ def require_choices(config: object) -> None:
     """Raise ConfigError unless the fields of Literal types have one of their values."""
     for name, hint in typing.get_type_hints(type(config)).items():
         if typing.get_origin(hint) is Literal:
-            got, choices = getattr(config, name), typing.get_args(hint)
-            require(
-                got in choices, name, got, "one of " + ", ".join(map(repr, choices))
-            )
+            choices = typing.get_args(hint)
+            expected = "one of " + ", ".join(map(repr, choices))
+            require_fields(config, name, choices.__contains__, expected)

@@ -23,16 +23,16 @@ class Outcome:
 
     reward: Tensor
     """r_t as the env gives it [N]."""
-    terms: Tensor | None
-    """`reward_generator.TERMS` as measured [N, K]; None where the reward is sparse."""
     terminated: Tensor
     """Whether the episode ended for good [N] bool: nothing more would have come."""
     truncated: Tensor
     """Whether time ran out [N] bool: more would have come."""
     state: State
     """s_{t+1}; where an episode ended, the first state of the next one."""
-    final: State | None
+    final: State | None = None
     """s_{t+1} of the episodes that ended; other rows mean nothing. None: none ended."""
+    terms: Tensor | None = None
+    """`reward_generator.TERMS` as measured [N, K]; None where the reward is sparse."""
 
     @property
     def done(self) -> Tensor:

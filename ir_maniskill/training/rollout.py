@@ -3,7 +3,7 @@
 Legend: T steps, N envs, S stacked observations, A numbers of an action, B steps drawn.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,20 +13,14 @@ from ir_maniskill.environment.senses import State
 from ir_maniskill.training import distributed
 
 
-@dataclass
-class Batch:
+class Batch(NamedTuple):
     """Steps drawn from the roll-outs, B of them."""
 
-    state: State
-    """s_t, each entry [B, ...]."""
-    action: Tensor
-    """a_t as sampled, not clipped [B, A]."""
-    log_prob: Tensor
-    """log pi(a_t|s_t) when it was sampled [B]."""
-    advantage: Tensor
-    """A_t [B]."""
-    returns: Tensor
-    """What the critic should have said [B]."""
+    state: State  # s_t, each entry [B, ...]
+    action: Tensor  # a_t as sampled, not clipped [B, A]
+    log_prob: Tensor  # log pi(a_t|s_t) when it was sampled [B]
+    advantage: Tensor  # A_t [B]
+    returns: Tensor  # what the critic should have said [B]
 
 
 class Frames:

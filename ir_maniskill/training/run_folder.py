@@ -9,7 +9,7 @@ import logging
 import os
 import signal
 import threading
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -87,9 +87,8 @@ class RunFolder:
         Returns:
             The steps of the last evaluation recorded; 0 if there is none.
         """
-        for pattern in (".*.tmp", ".[0-9]*.*"):  # what a process left when killed
-            for leftover in self.path.glob(pattern):
-                leftover.unlink()
+        for leftover in self.path.glob(".[0-9]*.*"):  # of a process that was killed
+            leftover.unlink()
         self._events = SummaryWriter(str(self.path), purge_step=steps + 1)
         self.write("config.json", (to_json(config) + "\n").encode())
         self._cut("metrics", steps)
@@ -169,13 +168,9 @@ def whole_rows(table: Path) -> list[dict[str, str]]:
     return [row for row in rows if None not in row and None not in row.values()]
 
 
-def _format(rows: Iterable[Mapping[str, object]], *, header: bool) -> bytes:
+def _format(rows: Sequence[Mapping[str, object]], *, header: bool) -> bytes:
     """Return the lines of a CSV table."""
     text = io.StringIO(newline="")
-    for row in rows:
-        writer = csv.DictWriter(text, list(row))
-        if header:
-            writer.writeheader()
-            header = False
-        writer.writerow(row)
+    names = [list(row) for row in rows[:1] if header]
+    csv.writer(text).writerows(names + [list(row.values()) for row in rows])
     return text.getvalue().encode()

@@ -139,23 +139,17 @@ class Runner:
             info = info_of_step(info, done)
             self.state = self._here(self.stack.push(obs, done))
             self.counts.add(reward, done, info)
-            terms = info.get("reward_terms")
-            measured = {"reward": reward} if terms is None else {"reward terms": terms}
-            check_finite(measured, "outcome", "the simulation became unstable")
-            self.algorithm.observe(
-                Outcome(
-                    reward=reward.to(self.device),
-                    terms=None if terms is None else terms.to(self.device),
-                    terminated=terminated.to(self.device),
-                    truncated=truncated.to(self.device),
-                    state=self.state,
-                    final=final,
-                )
-            )
+            ends = {"terminated": terminated, "truncated": truncated}
+            paid = {"reward": reward}
+            if "reward_terms" in info:
+                paid["terms"] = info["reward_terms"]
+            check_finite(paid, "outcome", "the simulation became unstable")
+            here = self._here(paid | ends)
+            self.algorithm.observe(Outcome(**here, state=self.state, final=final))
         self.steps += self.config.num_envs
 
     def _here(self, state: State) -> State:
-        """Return the state on the learner's device."""
+        """Return tensors on the learner's device."""
         return {key: value.to(self.device) for key, value in state.items()}
 
     def _new_scenes(self) -> State:
