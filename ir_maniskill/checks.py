@@ -1,7 +1,8 @@
 """Checks of what is given, and the errors that they raise: got, expected, available."""
 
 import typing
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Literal
 
 
 class ConfigError(ValueError):
@@ -34,3 +35,21 @@ def require_type(
 ) -> None:
     """Raise the error unless the value is of that type."""
     require(isinstance(got, kind), name, got, f"a {kind.__name__}", error)
+
+
+def require_fields(
+    config: object, names: str, fits: Callable[[Any], bool], expected: str
+) -> None:
+    """Raise ConfigError unless each of the fields, named side by side, fits."""
+    for name in names.split():
+        value = getattr(config, name)
+        require(fits(value), name, value, expected)
+
+
+def require_choices(config: object) -> None:
+    """Raise ConfigError unless the fields of Literal types have one of their values."""
+    for name, hint in typing.get_type_hints(type(config)).items():
+        if typing.get_origin(hint) is Literal:
+            choices = typing.get_args(hint)
+            expected = "one of " + ", ".join(map(repr, choices))
+            require_fields(config, name, choices.__contains__, expected)

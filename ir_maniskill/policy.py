@@ -42,10 +42,8 @@ class Policy:
         ...     obs, reward, terminated, truncated, info = envs.step(policy.act(obs))
         ...     policy.reset(terminated | truncated)
 
-    Attributes:
-        agent: The network.
-        config: How it was trained.
-        metadata: What its file says: `steps`, `evaluation`, `task`, ...
+    `agent` is the network, `config` how it was trained, `metadata` what its file says:
+    `steps`, `evaluation`, `task`, ...
     """
 
     def __init__(
@@ -73,8 +71,7 @@ class Policy:
     def reset(self, done: Tensor | None = None) -> None:
         """Forget what was seen, before an observation that begins an episode.
 
-        Args:
-            done: Envs whose next observation begins an episode [N] bool; None: all.
+        `done` [N] bool are the envs where it does; None: all.
         """
         if done is None:
             self._stack: StateStack | None = None
@@ -86,9 +83,7 @@ class Policy:
     ) -> Tensor:
         """Return the actions [N, A] in [-1, 1] for the next observation of N envs.
 
-        Args:
-            obs: What a vector env, or a single one of `gym.make`, observes.
-            sentences: Said to it in place of the envs' own, one for all or N.
+        `sentences` are said in place of the envs' own, one for all or N.
 
         Raises:
             ValueError: The observation lacks something, a sentence is too long, or N
@@ -116,15 +111,10 @@ class Policy:
         *,
         any_task: bool = False,
     ) -> None:
-        """Raise unless it was trained for this task, as it is now, and this robot.
+        """Raise MismatchError unless it was trained for this task and robot.
 
-        Args:
-            experiment: The task.
-            robot: What `robot_uids` takes; None: its own.
-            any_task: Accept another task, if it has the same words.
-
-        Raises:
-            MismatchError: Naming all that is different.
+        `robot` is what `robot_uids` takes, None its own; `any_task` accepts another
+        task, if it has the same words.
         """
         pairs: dict[str, tuple[Any, Any]] = {}
         if self.vocabulary != experiment.vocabulary:

@@ -160,6 +160,15 @@ def test_a_config_of_before_postures_and_backends_has_neither():
     assert config.ppo.std == config.ppo.std_final == 0.5
 
 
+def test_sizes_that_became_constants_are_known_and_no_others():
+    data = to_data(TrainConfig())
+    data["agent"] |= {"language_width": 50, "vision_channels": [32, 32, 32]}
+    assert from_data(data) == TrainConfig()
+    data["agent"]["language_width"] = 64
+    with pytest.raises(ConfigError, match="language_width: got 64, expected 50"):
+        from_data(data)
+
+
 def replace_leaf(data, path, value):
     """Return JSON data with another value at a path of keys."""
     if not path:

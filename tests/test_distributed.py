@@ -358,7 +358,7 @@ def test_torchrun_trains_on_the_real_task(tmp_path):
     command = Path(sys.executable).with_name("ir-maniskill")
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
     torchrun += ["--nproc-per-node", "2", "--no-python", str(command)]
-    options = "--agent.senses state --agent.hidden 16 --agent.language-layers 1 "
+    options = "--agent.senses state --agent.hidden 16 "
     options += (
         "--num-envs 4 --ppo.steps-per-update 128 --ppo.minibatch 64 --ppo.epochs 1 "
     )

@@ -128,7 +128,7 @@ def test_a_run_resumed_at_a_checkpoint_equals_one_never_interrupted(
 ):
     senses = ("vision", "proprioception") if images else ("proprioception",)
     changes = {} if not images else {"camera_height": 16, "camera_width": 8}
-    agent = AgentConfig(senses=senses, hidden=(32, 32), language_layers=1)
+    agent = AgentConfig(senses=senses, hidden=(32, 32))
 
     def config(name):
         return toy_config(tmp_path / name, agent=agent, **changes)

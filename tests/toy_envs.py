@@ -123,7 +123,7 @@ class ToyVectorEnv:
 
 def toy_config(out, **changes):
     """Return a config with which the toy task is learned in seconds."""
-    agent = AgentConfig(senses=("proprioception",), hidden=(32, 32), language_layers=1)
+    agent = AgentConfig(senses=("proprioception",), hidden=(32, 32))
     ppo = PPOConfig(32 * LENGTH, epochs=8, minibatch=64, gamma=0.95, std=0.5)
     values = {
         "env_id": "Toy-v1",

@@ -34,12 +34,7 @@ class Actor(nn.Module):
     log_std: Tensor
 
     def __init__(
-        self,
-        inputs: int,
-        hidden: Sequence[int],
-        actions: int,
-        *,
-        posture_gain: float = 0.0,
+        self, inputs: int, hidden: Sequence[int], actions: int, posture_gain: float = 0
     ) -> None:
         """Make the layers; at first they give about 0, the middle of each joint."""
         super().__init__()
@@ -48,11 +43,9 @@ class Actor(nn.Module):
         self.register_buffer("log_std", torch.zeros(actions))
 
     def forward(self, aligned: Tensor, target: Tensor) -> Normal:
-        """Return the distribution of a_t [N, A].
+        """Return the distribution of a_t [N, A], of B_t [N, D].
 
-        Args:
-            aligned: B_t [N, D].
-            target: The joint targets [N, A] in [-1, 1]; unused without `posture_gain`.
+        The joint targets [N, A] in [-1, 1] are unused without `posture_gain`.
         """
         mean = self.mean(aligned)
         if self.posture_gain > 0:

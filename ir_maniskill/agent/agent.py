@@ -14,7 +14,13 @@ from ir_maniskill.agent.actor import Actor, tanh_layers
 from ir_maniskill.agent.alignment import Alignment
 from ir_maniskill.agent.config import AgentConfig
 from ir_maniskill.agent.critic import Critic, Standardize
-from ir_maniskill.agent.perceptual_system import BodySense, PaperVision, PatchVision
+from ir_maniskill.agent.perceptual_system import (
+    BODY_WIDTH,
+    VISION_WIDTH,
+    BodySense,
+    PaperVision,
+    PatchVision,
+)
 from ir_maniskill.checks import require
 from ir_maniskill.environment.senses import State, askable
 from ir_maniskill.environment.senses import entries as entries_of
@@ -55,10 +61,8 @@ class StateSpec:
 
 def asks(config: AgentConfig) -> tuple[str, ...]:
     """Return what an env must be asked to observe for this agent: its `observe`."""
-    reads = (
-        *language_system.encoder_of(config).reads,
-        *entries_of(config.senses or ()),
-    )
+    said = language_system.encoder_of(config).reads
+    reads = (*said, *entries_of(config.senses or ()))
     return tuple(name for name in reads if name in askable())
 
 
@@ -91,32 +95,33 @@ class StateEncoder(nn.Module):
             ConfigError: A sense is not among what the env observes.
         """
         super().__init__()
-        entries = entries_of(senses)
-        for name in entries:
-            observed = ", ".join(spec.shapes)
-            require(
-                name in spec.shapes, "senses", senses, f"those observed: {observed}"
-            )
+        entries, observed = entries_of(senses), ", ".join(spec.shapes)
+        fits = entries.keys() <= spec.shapes.keys()
+        require(fits, "senses", senses, f"those observed: {observed}")
         self.sensed = tuple(entries)
         """Entries of the state that it needs, beside the sentence."""
+        self.felt = tuple(name for name in entries if name != "images")
         self.language = language_system.encoder_of(config)(config)
-        self.width = self.language.width
-        """Size of B_t."""
         self.vision: nn.Module | None = None
+        self.standardize: Standardize | None = None
+        self.body: BodySense | None = None
         if "images" in entries:
             self.vision = self._vision(config, spec.shapes["images"])
-            self.width += config.vision_width
-        self.standardize: Standardize | None = None
         if "privileged" in entries:
             self.standardize = Standardize(*spec.shapes["privileged"])
-        self.felt = tuple(n for n in entries if n != "images")
-        self.body: BodySense | None = None
         if self.felt:
             inputs = sum(math.prod(spec.shapes[name]) for name in self.felt)
-            patches = config.vision == "patches"
-            self.body = BodySense(inputs, config.body_width, normalize=patches)
-            self.width += config.body_width
+            self.body = BodySense(inputs, normalize=config.vision == "patches")
+        self.width = self.language.width  # of B_t
+        self.width += VISION_WIDTH if self.vision is not None else 0
+        self.width += BODY_WIDTH if self.felt else 0
         self.alignment = Alignment()
+
+    def _vision(self, config: AgentConfig, shape: tuple[int, ...]) -> nn.Module:
+        frames, cameras, height, width, _ = shape
+        if config.vision == "paper":
+            return PaperVision(frames, cameras)
+        return PatchVision(frames, (cameras, height, width), self.language.width)
 
     def forward(self, state: State) -> Tensor:
         """Return B_t [N, D] = [G_t, V_t, H_t]."""
@@ -133,18 +138,6 @@ class StateEncoder(nn.Module):
             return self.standardize(state[name])
         return state[name]
 
-    def _vision(self, config: AgentConfig, shape: tuple[int, ...]) -> nn.Module:
-        frames, cameras, height, width, _ = shape
-        if config.vision == "paper":
-            return PaperVision(frames, cameras, config.vision_width)
-        return PatchVision(
-            frames,
-            (cameras, height, width),
-            config.vision_channels,
-            config.vision_width,
-            film_width=self.language.width,
-        )
-
 
 class Agent(nn.Module):
     """The learner: reads the state s_t, acts, and judges how good the state is."""
@@ -152,31 +145,24 @@ class Agent(nn.Module):
     def __init__(
         self, config: AgentConfig, spec: StateSpec, *, policy_only: bool = False
     ) -> None:
-        """Make an untrained agent.
+        """Make an untrained agent; the config must say which `senses` it has.
 
-        Args:
-            config: Its parts; `senses` must be given.
-            spec: Shapes of what it reads and does.
-            policy_only: Leave out what only training needs (critic, auxiliary head).
+        `policy_only` leaves out what only training needs: critic and auxiliary head.
         """
         super().__init__()
         if config.senses is None:
             raise ValueError("senses: got None, expected the experiment's senses")
         self.config, self.spec = config, spec
         self.encoder = StateEncoder(config, spec, config.senses)
-        self.actor = Actor(
-            self.encoder.width,
-            config.hidden,
-            spec.actions,
-            posture_gain=config.posture_gain,
-        )
+        width, gain = self.encoder.width, config.posture_gain
+        self.actor = Actor(width, config.hidden, spec.actions, posture_gain=gain)
         self.critic_encoder: StateEncoder | None = None
         self.critic: Critic | None = None
         self.locator: nn.Sequential | None = None
         if not policy_only:
             self._make_critic(config, spec)
             if config.auxiliary_weight > 0:
-                self.locator = tanh_layers(self.encoder.width, (128,), 3, gain=0.1)
+                self.locator = tanh_layers(width, (128,), 3, gain=0.1)
 
     def _make_critic(self, config: AgentConfig, spec: StateSpec) -> None:
         senses = config.senses or ()
@@ -187,8 +173,8 @@ class Agent(nn.Module):
                     "observation has none; got an obs_mode without it, expected "
                     "'rgb+state_dict' or 'state_dict'"
                 )
-            # What the robot feels, whether the actor does or not, and senses of one's
-            # own: only pictures are left out, which the state stands for.
+            # All that is felt; of the actor's senses only pictures are left out, which
+            # the state stands for.
             every = ("proprioception", "target", "touch", "state", *senses)
             senses = tuple(sense for sense in dict.fromkeys(every) if sense != "vision")
         self.critic_encoder = StateEncoder(config, spec, senses)

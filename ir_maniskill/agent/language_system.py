@@ -15,13 +15,15 @@ from ir_maniskill.agent.config import AgentConfig
 from ir_maniskill.checks import require
 from ir_maniskill.experiment import PAD
 
+LAYERS, HEADS, WIDTH = 3, 2, 50
+"""Of the paper's transformer: its layers, their heads, and D."""
+
 
 class LanguageEncoder(nn.Module):
     """Base of what reads sentences; one of your own is a subclass and `register`.
 
-    It is called with the entries of the state that it `reads`, and returns G_t
-    [N, width]. Whatever tensors it holds must be in its `state_dict`: where a policy is
-    loaded they come from the file.
+    It returns G_t [N, width] of the entries of the state that it `reads`. All tensors
+    that it holds must be in its `state_dict`: a loaded policy has them from the file.
     """
 
     reads: ClassVar[tuple[str, ...]] = ("instruction",)
@@ -62,17 +64,16 @@ def encoder_of(config: AgentConfig) -> type[LanguageEncoder]:
 class EncoderLayer(nn.Module):
     """One layer of a transformer encoder: self-attention, then a feed-forward net."""
 
-    def __init__(self, width: int, heads: int) -> None:
-        """Make a layer of `width` units shared among `heads`."""
+    def __init__(self) -> None:
+        """Make an untrained layer."""
         super().__init__()
-        self.heads = heads
-        self.queries_keys_values = nn.Linear(width, 3 * width)  # W_Q, W_K, W_V
-        self.mix = nn.Linear(width, width)
-        self.attention_norm = nn.LayerNorm(width)
+        self.queries_keys_values = nn.Linear(WIDTH, 3 * WIDTH)  # W_Q, W_K, W_V
+        self.mix = nn.Linear(WIDTH, WIDTH)
+        self.attention_norm = nn.LayerNorm(WIDTH)
         self.feed_forward = nn.Sequential(
-            nn.Linear(width, 4 * width), nn.ReLU(), nn.Linear(4 * width, width)
+            nn.Linear(WIDTH, 4 * WIDTH), nn.ReLU(), nn.Linear(4 * WIDTH, WIDTH)
         )
-        self.feed_forward_norm = nn.LayerNorm(width)
+        self.feed_forward_norm = nn.LayerNorm(WIDTH)
 
     def forward(self, tokens: Tensor, attend: Tensor) -> Tensor:
         """Return the tokens [N, L, D], each informed by those it may attend to.
@@ -80,7 +81,7 @@ class EncoderLayer(nn.Module):
         Softmax(W_Q Q (W_K K)^T / sqrt(d)) W_V V, with Q = K = V = the tokens.
         """
         projected = self.queries_keys_values(tokens)  # [N, L, 3D]
-        split = projected.unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        split = projected.unflatten(-1, (3, HEADS, -1)).permute(2, 0, 3, 1, 4)
         queries, keys, values = split  # [N, heads, L, D/heads] each
         heads = functional.scaled_dot_product_attention(
             queries, keys, values, attn_mask=attend[:, None, None, :]
@@ -101,14 +102,11 @@ class TokenTransformer(LanguageEncoder):
     def __init__(self, config: AgentConfig) -> None:
         """Make the untrained layers."""
         super().__init__(config)
-        self.length, width = config.language_length, config.language_width
-        self.width = self.length * width
-        self.words = nn.Embedding(len(config.vocabulary), width, padding_idx=PAD)
-        self.positions = nn.Parameter(0.1 * torch.randn(self.length, width))
-        self.layers = nn.ModuleList(
-            EncoderLayer(width, config.language_heads)
-            for _ in range(config.language_layers)
-        )
+        self.length = config.language_length
+        self.width = self.length * WIDTH
+        self.words = nn.Embedding(len(config.vocabulary), WIDTH, padding_idx=PAD)
+        self.positions = nn.Parameter(0.1 * torch.randn(self.length, WIDTH))
+        self.layers = nn.ModuleList(EncoderLayer() for _ in range(LAYERS))
 
     def forward(self, instruction: Tensor) -> Tensor:
         """Return G_t [N, width] of the token ids [N, L].

@@ -1,13 +1,17 @@
 """Perceptual System: images become V_t; proprioception and touch become H_t."""
 
-import itertools
-from collections.abc import Sequence
+import math
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from ir_maniskill.agent.alignment import FiLM
+
+VISION_WIDTH, BODY_WIDTH = 256, 128
+"""Units of V_t and of H_t."""
+CHANNELS, PATCH = 32, 4
+"""Maps of each convolution of "patches", and the side of its patches [pixel]."""
 
 
 def pixels(images: Tensor) -> Tensor:
@@ -24,7 +28,7 @@ class PaperVision(nn.Module):
     height, width = 128, 64
     """Size each camera's image is brought to [pixel]."""
 
-    def __init__(self, frames: int, cameras: int, features: int) -> None:
+    def __init__(self, frames: int, cameras: int) -> None:
         """Make the net for `frames` stacked images of `cameras` cameras."""
         super().__init__()
         sides = (self.height, self.width * cameras)
@@ -34,8 +38,8 @@ class PaperVision(nn.Module):
             *(nn.Conv2d(12, 12, 5), nn.ReLU(), nn.MaxPool2d(2)),
         )
         self.embedding = nn.Sequential(
-            *(nn.Linear(12 * maps[0] * maps[1], features), nn.ReLU()),
-            *(nn.Linear(features, features), nn.ReLU()),
+            *(nn.Linear(12 * maps[0] * maps[1], VISION_WIDTH), nn.ReLU()),
+            *(nn.Linear(VISION_WIDTH, VISION_WIDTH), nn.ReLU()),
         )
 
     def forward(self, images: Tensor, language: Tensor) -> Tensor:
@@ -57,46 +61,27 @@ class CameraVision(nn.Module):
     training was seen to shift all maps below zero, and the agent was blind.
     """
 
-    PATCH = 4
-    """Side of the patches that the first convolution reads [pixel]."""
-
-    def __init__(self, frames: int, channels: Sequence[int], film_width: int) -> None:
-        """Make one convolution for each of `channels`; no FiLM if `film_width` is 0."""
+    def __init__(self, frames: int, film_width: int) -> None:
+        """Make the layers for `frames` stacked images and `film_width` units of G_t."""
         super().__init__()
-        patches = nn.Conv2d(3 * frames, channels[0], self.PATCH, stride=self.PATCH)
-        pairs = itertools.pairwise(channels)
         self.convolutions = nn.ModuleList(
-            [patches]
-            + [
-                nn.Conv2d(into, out, 3, stride=1 if i else 2, padding=1)
-                for i, (into, out) in enumerate(pairs)
-            ]
+            (
+                nn.Conv2d(3 * frames, CHANNELS, PATCH, stride=PATCH),
+                nn.Conv2d(CHANNELS, CHANNELS, 3, stride=2, padding=1),
+                nn.Conv2d(CHANNELS, CHANNELS, 3, padding=1),
+            )
         )
-        self.norms = nn.ModuleList(
-            nn.GroupNorm(1, out, affine=False) for out in channels
-        )
-        self.films = nn.ModuleList(
-            FiLM(film_width, out) if film_width and i else nn.Identity()
-            for i, out in enumerate(channels)
-        )
-
-    @classmethod
-    def cells(cls, height: int, width: int, convolutions: int) -> int:
-        """Return how many places the maps of an image [pixel] have in the end."""
-        sides = (height // cls.PATCH, width // cls.PATCH)
-        if convolutions > 1:
-            sides = ((sides[0] + 1) // 2, (sides[1] + 1) // 2)
-        return sides[0] * sides[1]
+        films = (FiLM(film_width, CHANNELS) for _ in range(2))
+        self.films = nn.ModuleList((nn.Identity(), *films))
 
     def forward(self, images: Tensor, language: Tensor) -> Tensor:
         """Return the flat maps [N, D] of this camera's images [N, S, H, W, 3]."""
         maps = pixels(torch.cat(images.unbind(1), dim=-1))  # [N, 3S, H, W]
-        layers = zip(self.convolutions, self.norms, self.films, strict=True)
-        for convolve, normalize, film in layers:
+        for convolve, film in zip(self.convolutions, self.films, strict=True):
             maps = convolve(maps)
             if isinstance(film, FiLM):
                 maps = film(maps, language)
-            maps = functional.relu(normalize(maps), inplace=True)
+            maps = functional.relu(functional.group_norm(maps, 1), inplace=True)
         return maps.flatten(1)
 
 
@@ -107,24 +92,19 @@ class PatchVision(nn.Module):
     """
 
     def __init__(
-        self,
-        frames: int,
-        size: tuple[int, int, int],
-        channels: Sequence[int],
-        features: int,
-        *,
-        film_width: int,
+        self, frames: int, size: tuple[int, int, int], film_width: int
     ) -> None:
         """Make the nets for images of `size` (cameras, height, width)."""
         super().__init__()
-        cameras, height, width = size
+        cameras, *sides = size
         self.cameras = nn.ModuleList(
-            CameraVision(frames, channels, film_width) for _ in range(cameras)
+            CameraVision(frames, film_width) for _ in range(cameras)
         )
-        cells = CameraVision.cells(height, width, len(channels))
-        flat = cameras * channels[-1] * cells
+        cells = math.prod((side // PATCH + 1) // 2 for side in sides)
         self.embedding = nn.Sequential(
-            nn.Linear(flat, features), nn.LayerNorm(features), nn.Tanh()
+            nn.Linear(cameras * CHANNELS * cells, VISION_WIDTH),
+            nn.LayerNorm(VISION_WIDTH),
+            nn.Tanh(),
         )
 
     def forward(self, images: Tensor, language: Tensor) -> Tensor:
@@ -138,17 +118,11 @@ class PatchVision(nn.Module):
 class BodySense(nn.Module):
     """H_t: proprioception and touch together, through one linear layer."""
 
-    def __init__(self, inputs: int, features: int, *, normalize: bool) -> None:
-        """Make the layer from `inputs` numbers to `features` units.
-
-        Args:
-            inputs: Numbers felt.
-            features: Units of H_t.
-            normalize: Whether to bring H_t to the scale of G_t.
-        """
+    def __init__(self, inputs: int, *, normalize: bool) -> None:
+        """Make the layer for `inputs` numbers; `normalize`: to the scale of G_t."""
         super().__init__()
-        norm = nn.LayerNorm(features) if normalize else nn.Identity()
-        self.embedding = nn.Sequential(nn.Linear(inputs, features), norm, nn.Tanh())
+        norm = nn.LayerNorm(BODY_WIDTH) if normalize else nn.Identity()
+        self.embedding = nn.Sequential(nn.Linear(inputs, BODY_WIDTH), norm, nn.Tanh())
 
     def forward(self, *senses: Tensor) -> Tensor:
         """Return H_t [N, D] of senses [N, ...], flattened side by side."""

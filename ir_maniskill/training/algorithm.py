@@ -9,8 +9,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
+from torch.optim import Optimizer
 
 from ir_maniskill.agent.agent import Agent
 from ir_maniskill.environment.senses import State
@@ -23,18 +23,16 @@ class Outcome:
 
     reward: Tensor
     """r_t as the env gives it [N]."""
-    terms: Tensor | None
-    """What the dense reward consists of, as measured [N, K], named by
-    `reward_generator.TERMS`; None where the env gives none (its reward is sparse)."""
     terminated: Tensor
-    """Whether the episode ended for good [N] bool: there is nothing more to come."""
+    """Whether the episode ended for good [N] bool: nothing more would have come."""
     truncated: Tensor
     """Whether time ran out [N] bool: more would have come."""
     state: State
-    """s_{t+1}, which the next action is for; where an episode ended, the first state
-    of the next one."""
-    final: State | None
+    """s_{t+1}; where an episode ended, the first state of the next one."""
+    final: State | None = None
     """s_{t+1} of the episodes that ended; other rows mean nothing. None: none ended."""
+    terms: Tensor | None = None
+    """`reward_generator.TERMS` as measured [N, K]; None where the reward is sparse."""
 
     @property
     def done(self) -> Tensor:
@@ -55,13 +53,7 @@ class Algorithm(ABC):
 
     @abstractmethod
     def __init__(self, config: TrainConfig, state: State, actions: int) -> None:
-        """Make what is still untrained.
-
-        Args:
-            config: All numbers of the training.
-            state: The first state of this rank's envs: tells N, shapes and device.
-            actions: A.
-        """
+        """Make what is still untrained, for states like the first one and A actions."""
 
     @abstractmethod
     def act(self, state: State) -> Tensor:
@@ -77,10 +69,7 @@ class Algorithm(ABC):
 
     @abstractmethod
     def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of all that has to survive a restart of the program.
-
-        The agent's weights are in it as `agent.NAME`.
-        """
+        """Return copies of all that a resumed run needs; its weights: `agent.NAME`."""
 
     @abstractmethod
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
@@ -101,20 +90,14 @@ def copied(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {f"{prefix}.{k}": v.detach().clone() for k, v in tensors.items()}
 
 
-def averages(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+def averages(optimizer: Optimizer) -> dict[str, Tensor]:
     """Return an optimizer's averages by weight and name, e.g. `0.exp_avg`."""
     state = optimizer.state_dict()["state"]
     return {f"{i}.{name}": v for i, kept in state.items() for name, v in kept.items()}
 
 
-def load_averages(
-    optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor]
-) -> None:
-    """Load what `averages` returned.
-
-    Raises:
-        ValueError: If an average has not the shape of its weight.
-    """
+def load_averages(optimizer: Optimizer, tensors: Mapping[str, Tensor]) -> None:
+    """Load what `averages` returned; ValueError: one has not its weight's shape."""
     weights = [w for group in optimizer.param_groups for w in group["params"]]
     state: dict[int, dict[str, Tensor]] = {}
     for name, tensor in tensors.items():

@@ -88,7 +88,7 @@ def read(path: Path) -> Stored:
     """Return the contents of a checkpoint or policy file, in today's form.
 
     Raises:
-        CheckpointError: If the file is missing, foreign, broken, or of a later version.
+        CheckpointError: It is missing, foreign, broken, or of a later version.
     """
     path = Path(path)
     if path.exists() and not path.is_file():  # reading a pipe might never end

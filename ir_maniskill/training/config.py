@@ -1,30 +1,22 @@
-"""Every number of a training run, as frozen dataclasses that survive JSON.
-
-`CONFIGS["default"]` holds our tuned values, `CONFIGS["vision"]` those for pictures
-alone, `CONFIGS["paper"]` what the paper and its reference code say; all run the same
-code.
-"""
+"""Every number of a training run, as frozen dataclasses that survive JSON."""
 
 import dataclasses
 import json
 import math
 import types
 import typing
-from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 from ir_maniskill.agent.agent import asks
-from ir_maniskill.agent.config import AgentConfig, from_version_1
-from ir_maniskill.checks import ConfigError, require, require_choice
+from ir_maniskill.agent.config import AgentConfig, from_version_1, without_constants
+from ir_maniskill.checks import ConfigError, require, require_choices, require_fields
 from ir_maniskill.environment.reward_generator import RewardWeights
 
 ControlMode = Literal["pd_joint_target_delta_pos", "pd_joint_pos"]
 RewardMode = Literal["dense", "sparse"]
 SimBackend = Literal["physx_cpu", "physx_cuda"]
 RenderBackend = Literal["auto", "cpu"]
-
-Config = TypeVar("Config")
 
 SCHEMA = 2
 """Version of the form in which configs are written."""
@@ -42,8 +34,7 @@ class PPOConfig:
     """Proximal policy optimization."""
 
     steps_per_update: int = 2048
-    """Steps collected for each update, over all envs and ranks; rounded up to whole
-    steps of all envs."""
+    """Steps of each update, over all envs and ranks; rounded up to steps of all."""
     epochs: int = 5
     """Passes over the collected steps, at most."""
     minibatch: int | None = 256
@@ -60,9 +51,8 @@ class PPOConfig:
     """Largest change of an action's probability ratio that is rewarded."""
     target_kl: float | None = 0.015
     """How far an epoch should find the policy moved [nat]: Adam's step size shrinks
-    where it is twice as far, to 1e-5 at least, and grows where it is half, to 1e-3 at
-    most; where it is more than three times as far no epoch follows. None: the step
-    size stays, and all epochs are made."""
+    where it is twice as far, and grows where it is half; where it is more than three
+    times as far no epoch follows. None: the step size stays, all epochs are made."""
     max_grad_norm: float | None = 0.5
     """Longest gradient; None: any."""
     std: float = 1.0
@@ -72,20 +62,15 @@ class PPOConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
-        for name in ("steps_per_update", "epochs"):
-            require(getattr(self, name) > 0, name, getattr(self, name), "at least 1")
+        require_fields(self, "steps_per_update epochs", lambda x: x > 0, "at least 1")
         batch, total = self.minibatch, self.steps_per_update
         fits = batch is None or 2 <= batch <= total
         require(fits, "minibatch", batch, f"2 to {total} steps, or None")
-        for name in ("gamma", "gae_lambda"):
-            value = getattr(self, name)
-            require(0 <= value <= 1, name, value, "0 to 1")
-        for name in ("learning_rate", "clip", "std", "std_final"):
-            value = getattr(self, name)
-            require(0 < value < math.inf, name, value, "more than 0, and finite")
-        for name in ("target_kl", "max_grad_norm"):
-            value = getattr(self, name)
-            require(value is None or value > 0, name, value, "more than 0, or None")
+        require_fields(self, "gamma gae_lambda", lambda x: 0 <= x <= 1, "0 to 1")
+        above, expected = "learning_rate clip std std_final", "more than 0, and finite"
+        require_fields(self, above, lambda x: 0 < x < math.inf, expected)
+        above, expected = "target_kl max_grad_norm", "more than 0, or None"
+        require_fields(self, above, lambda x: x is None or x > 0, expected)
 
 
 @dataclass(frozen=True)
@@ -105,15 +90,13 @@ class TrainConfig:
     num_envs: int = 16
     """Scenes simulated side by side, over all ranks."""
     sim_backend: SimBackend = "physx_cpu"
-    """Where physics is computed: "physx_cpu" has worker processes on the cores,
-    "physx_cuda" all envs in one batch on the GPU."""
+    """Physics: worker processes on the cores, or all envs in a batch on the GPU."""
     render_backend: RenderBackend = "auto"
     """What draws: "auto" is a GPU if there is one, "cpu" the cores, through Mesa."""
     num_workers: int | None = None
     """Simulator processes of each rank on the CPU; None: one a core."""
     threads: int | None = None
-    """Threads of each rank's update; None: one a core, or one alone where waiting
-    threads would keep cores busy (OMP_WAIT_POLICY was not passive when torch began)."""
+    """Threads of each rank's update; None: as `distributed.threads` says."""
     control_mode: ControlMode = "pd_joint_target_delta_pos"
     """What an action means: "pd_joint_target_delta_pos" moves the joint targets,
     "pd_joint_pos" sets them (the paper's)."""
@@ -122,11 +105,9 @@ class TrainConfig:
     reward_weights: RewardWeights = field(default_factory=RewardWeights)
     """What counts how much in the dense reward."""
     penalty_warmup: float = 1 / 3
-    """Share of the training over which the dense reward's penalties grow from nothing
-    to what they are: first to reach the goal, then to reach it without a foul."""
+    """Share of the training over which the dense reward's penalties grow from 0."""
     shader_pack: str | None = "unlit"
-    """Shader pack of the cameras: "unlit" paints base colors and is by far the
-    cheapest, "minimal" and "default" are lit; None: the task's own."""
+    """Shader pack of the cameras: "unlit" is the cheapest; None: the task's own."""
     camera_height: int = 64
     """Height of each image [pixel]."""
     camera_width: int = 32
@@ -146,20 +127,12 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
-        positive = "total_steps num_envs camera_height camera_width frames "
-        positive += "eval_interval eval_episodes checkpoint_interval"
-        for name in positive.split():
-            require(getattr(self, name) > 0, name, getattr(self, name), "at least 1")
-        warmup = self.penalty_warmup
-        require(0 <= warmup <= 1, "penalty_warmup", warmup, "0 to 1")
-        for name in ("num_workers", "threads"):
-            value = getattr(self, name)
-            require(value is None or value > 0, name, value, "at least 1, or None")
-        require_choice("sim_backend", self.sim_backend, SimBackend)
-        require_choice("render_backend", self.render_backend, RenderBackend)
-        require_choice("control_mode", self.control_mode, ControlMode)
-        require_choice("reward_mode", self.reward_mode, RewardMode)
-        require(0 <= self.seed < 2**31, "seed", self.seed, "0 to 2**31 - 1")
+        require_choices(self)
+        positive = "total_steps num_envs num_workers threads camera_height camera_width"
+        positive += " frames eval_interval eval_episodes checkpoint_interval"
+        require_fields(self, positive, lambda x: x is None or x > 0, "at least 1")
+        require_fields(self, "penalty_warmup", lambda x: 0 <= x <= 1, "0 to 1")
+        require_fields(self, "seed", lambda x: 0 <= x < 2**31, "0 to 2**31 - 1")
         gain = self.agent.posture_gain
         fits = gain == 0 or self.control_mode == "pd_joint_target_delta_pos"
         expected = "0 where actions do not change the joint targets (control_mode)"
@@ -175,22 +148,16 @@ class TrainConfig:
         """T x N, the steps all envs make for one update."""
         return self.steps_per_env * self.num_envs
 
-    @property
-    def needs_state(self) -> bool:
-        """Whether training reads the simulator's state, beside what the actor sees."""
-        agent = self.agent
-        return agent.critic == "asymmetric" or agent.auxiliary_weight > 0
-
     def env_kwargs(self, *, training: bool) -> dict[str, Any]:
         """Keyword arguments for `gym.make`, for training or for using the policy."""
-        senses = self.agent.senses
+        agent, senses = self.agent, self.agent.senses
         sees = senses is None or "vision" in senses
-        state = (training and self.needs_state) or "state" in (senses or ())
+        # The critic and the auxiliary loss read the simulator's state.
+        learns_from = agent.critic == "asymmetric" or agent.auxiliary_weight > 0
+        state = (training and learns_from) or "state" in (senses or ())
         modes = {(True, True): "rgb+state_dict", (True, False): "rgb"}
-        cameras: dict[str, Any] = {
-            "width": self.camera_width,
-            "height": self.camera_height,
-        }
+        cameras: dict[str, Any] = {"width": self.camera_width}
+        cameras["height"] = self.camera_height
         if self.shader_pack is not None:
             cameras["shader_pack"] = self.shader_pack
         kwargs = {
@@ -248,7 +215,7 @@ CONFIGS: dict[str, TrainConfig] = {
     ),
 }
 """The named configurations: "default" for all that feel their joints, "vision" for
-pictures alone, "paper" as published."""
+pictures alone, "paper" as published; all run the same code."""
 
 
 # -- Files -----------------------------------------------------------------------------
@@ -268,26 +235,28 @@ def from_data(data: object) -> TrainConfig:
     """Return the configuration from plain data of this version or an earlier one.
 
     Raises:
-        ConfigError: If a field is unknown, missing, of another type than declared, or
-            out of its range.
+        ConfigError: If a field is unknown, missing, of another type or out of its
+            range, or a later version of the package wrote it.
     """
-    return decode(TrainConfig, migrate(data))
+    config: TrainConfig = _decode(TrainConfig, migrate(data), "TrainConfig")
+    return config
 
 
 def migrate(data: object) -> object:
     """Return a config's plain data of any version in today's form, without `schema`.
 
-    What no dictionary is, or lacks what its version has, is left to `decode` to refuse.
-
-    Raises:
-        ConfigError: If a later version of the package wrote it.
+    What no dictionary is, or lacks what its version has, is left to be refused.
     """
     if not isinstance(data, dict):
         return data
     fields = dict(data)
     schema = fields.pop("schema", 1)
     require(schema in range(1, SCHEMA + 1), "schema", schema, f"1 to {SCHEMA}")
-    return _from_version_1(fields) if schema == 1 else fields
+    if schema == 1:
+        fields = _from_version_1(fields)
+    if isinstance(agent := fields.get("agent"), dict):
+        fields["agent"] = without_constants(agent)
+    return fields
 
 
 def _from_version_1(old: dict[str, Any]) -> dict[str, Any]:
@@ -295,7 +264,7 @@ def _from_version_1(old: dict[str, Any]) -> dict[str, Any]:
     new = {"sim_backend": "physx_cpu", "render_backend": "auto", "robot": "nao", **old}
     parts = ("agent", "ppo", "dense_weights")
     if not all(isinstance(new.get(part), dict) for part in parts):
-        return new  # `decode` says what is missing
+        return new  # decoding says what is missing
     agent, ppo, dense = ({**new.pop(part)} for part in parts)
     try:
         new["penalty_warmup"] = new.pop("lenient_steps", 0) / new["total_steps"]
@@ -319,44 +288,20 @@ def _from_version_1(old: dict[str, Any]) -> dict[str, Any]:
     # The policy that was kept acts with the gain of the end.
     gain = agent.pop("posture_gain_final", None) or agent.get("posture_gain", 0.0)
     new |= {"agent": from_version_1(agent | {"posture_gain": gain}), "ppo": ppo}
-    _drop(new, ("eval_seed", "stop_at_success"))
-    _drop(ppo, ("value_weight", "entropy_weight", "normalize_reward", "max_kl"))
+    for name in ("eval_seed", "stop_at_success"):
+        new.pop(name, None)
+    for name in ("value_weight", "entropy_weight", "normalize_reward", "max_kl"):
+        ppo.pop(name, None)
     if new.get("reward_mode") == "normalized_dense":
         new["reward_mode"] = "dense"
     return new
-
-
-def _drop(data: dict[str, Any], names: Iterable[str]) -> None:
-    """Remove fields that are no more."""
-    for name in names:
-        data.pop(name, None)
-
-
-def decode(cls: type[Config], data: object) -> Config:
-    """Return the dataclass `cls` from plain JSON data, strictly.
-
-    Raises:
-        ConfigError: If a field is unknown, missing, of another type than declared, or
-            out of its range.
-    """
-    require(isinstance(data, dict), cls.__name__, data, "an object of its fields")
-    values = typing.cast("dict[str, object]", data)
-    hints = typing.get_type_hints(cls)
-    unknown, missing = sorted(values.keys() - hints), sorted(hints.keys() - values)
-    expected = f"exactly its fields (missing: {missing}, unknown: {unknown})"
-    require(not unknown and not missing, cls.__name__, sorted(values), expected)
-    fields = {name: _decode(hints[name], values[name], name) for name in hints}
-    try:
-        return cls(**fields)
-    except ValueError as error:  # the environment's classes know no ConfigError
-        raise ConfigError(str(error)) from error
 
 
 def _decode(hint: Any, value: Any, name: str) -> Any:
     """Return the JSON value as the annotated type, or raise ConfigError."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if dataclasses.is_dataclass(hint):
-        return decode(typing.cast("type", hint), value)
+        return _decode_fields(typing.cast("type", hint), value)
     if origin in (types.UnionType, typing.Union):
         if value is None and type(None) in arguments:
             return None
@@ -365,24 +310,34 @@ def _decode(hint: Any, value: Any, name: str) -> Any:
         require(isinstance(value, list | tuple), name, value, "a list")
         return tuple(_decode(arguments[0], item, name) for item in value)
     if origin is Literal:
-        require(value in arguments, name, value, f"one of {arguments}")
-        return value
+        return value  # its class refuses others
     if hint is float and type(value) is int:
         return float(value)
     require(type(value) is hint, name, value, f"a value of type {hint.__name__}")
     return value
 
 
+def _decode_fields(cls: type, data: Any) -> Any:
+    """Return the dataclass `cls` from plain data that has exactly its fields."""
+    require(isinstance(data, dict), cls.__name__, data, "an object of its fields")
+    hints = typing.get_type_hints(cls)
+    unknown, missing = sorted(data.keys() - hints), sorted(hints.keys() - data)
+    expected = f"exactly its fields (missing: {missing}, unknown: {unknown})"
+    require(not unknown and not missing, cls.__name__, sorted(data), expected)
+    fields = {name: _decode(hints[name], data[name], name) for name in hints}
+    try:
+        return cls(**fields)
+    except ValueError as error:  # the environment's classes know no ConfigError
+        raise ConfigError(str(error)) from error
+
+
 # -- Resuming --------------------------------------------------------------------------
 
 
 def resumed(stored: TrainConfig, given: TrainConfig) -> TrainConfig:
-    """Return the config with which a run goes on: its own, but for what may change.
+    """Return a run's own config, but for what may change and is given.
 
-    Given counts what differs from `TrainConfig()`.
-
-    Raises:
-        ConfigError: If something else is given that differs from the run's config.
+    Given counts what differs from `TrainConfig()`. ConfigError: it may not change.
     """
     usual = leaves(TrainConfig())
     told = {k: v for k, v in leaves(given).items() if v != usual[k] or k == "out"}
@@ -392,11 +347,7 @@ def resumed(stored: TrainConfig, given: TrainConfig) -> TrainConfig:
 
 
 def require_same(stored: TrainConfig, now: dict[str, Any]) -> None:
-    """Raise unless the leaves of a config are those of the run, or may change.
-
-    Raises:
-        ConfigError: Naming the fields that differ.
-    """
+    """Raise ConfigError unless `leaves` are those of the run, or may change."""
     different = [
         f"{name} (run: {value!r}, now: {now[name]!r})"
         for name, value in leaves(stored).items()

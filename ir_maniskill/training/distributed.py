@@ -12,6 +12,7 @@ import contextlib
 import os
 from collections.abc import Callable, Iterator
 from datetime import timedelta
+from textwrap import shorten
 from typing import TypeVar
 
 import torch
@@ -31,9 +32,7 @@ class RankError(RuntimeError):
 
 @contextlib.contextmanager
 def group(timeout: timedelta = TIMEOUT) -> Iterator[None]:
-    """Join the ranks that torchrun's environment variables tell of; leave at the end.
-
-    Does nothing in a process on its own, or in one that has joined already.
+    """Join the ranks that torchrun tells of, if there are any; leave at the end.
 
     Raises:
         RankError: If the others do not come.
@@ -44,7 +43,7 @@ def group(timeout: timedelta = TIMEOUT) -> Iterator[None]:
     backend = "gloo"
     if torch.cuda.is_available():
         backend = "cpu:gloo,cuda:nccl"
-        torch.cuda.set_device(_number_here())
+        torch.cuda.set_device(_local_rank())
     with _waiting():
         dist.init_process_group(backend, timeout=timeout)
     try:
@@ -67,7 +66,7 @@ def device() -> torch.device:
     """Return where this rank learns: each rank of a machine has a GPU of its own."""
     if not torch.cuda.is_available():
         return torch.device("cpu")
-    return torch.device("cuda", _number_here()) if size() > 1 else torch.device("cuda")
+    return torch.device("cuda", _local_rank()) if size() > 1 else torch.device("cuda")
 
 
 def cores() -> int:
@@ -79,10 +78,9 @@ def cores() -> int:
 def threads() -> int:
     """Return how many threads an update may use.
 
-    GNU's OpenMP lets threads that wait for each other keep their cores busy, unless it
+    Threads of GNU's OpenMP keep their cores busy as they wait for each other, unless it
     was told otherwise before torch loaded it (importing ir_maniskill first does that).
-    Where another program uses a core, updates then take ten times as long and more:
-    one thread waits for nobody.
+    Where another program uses a core, one thread, which waits for nobody, is faster.
     """
     passive = os.environ.get("OMP_WAIT_POLICY", "").lower() == "passive"
     return cores() if passive else 1
@@ -128,7 +126,7 @@ def from_first(make: Callable[[], T]) -> T:
     return box[0]  # type: ignore[return-value]
 
 
-def _number_here() -> int:
+def _local_rank() -> int:
     """Return the number of this rank among those of its machine."""
     return int(os.environ.get("LOCAL_RANK", "0"))
 
@@ -142,5 +140,5 @@ def _waiting() -> Iterator[None]:
         number = os.environ.get("RANK", "?")
         raise RankError(
             f"rank {number} lost the others: one of them failed and says why, or keeps "
-            f"the rest waiting for too long ({' '.join(str(error).split())[:200]})"
+            f"the rest waiting for too long ({shorten(str(error), 200)})"
         ) from error

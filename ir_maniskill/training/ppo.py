@@ -21,7 +21,7 @@ from ir_maniskill.training.algorithm import (
 from ir_maniskill.training.config import PPOConfig, TrainConfig
 from ir_maniskill.training.finite import check_finite
 from ir_maniskill.training.rollout import Batch, RewardScale, Rollout
-from ir_maniskill.training.schedules import Curriculum, Linear
+from ir_maniskill.training.schedules import Curriculum, linear
 
 VALUE_WEIGHT = 0.5
 """Weight of the critic's loss."""
@@ -51,7 +51,6 @@ class PPO(Algorithm):
         self.optimizer = torch.optim.Adam(self.agent.parameters(), rate, eps=1e-5)
         self.rollout = Rollout(config.steps_per_env, state, actions)
         self.reward_scale = RewardScale(self.rollout.num_envs, config.ppo.gamma)
-        self.noise = Linear(config.ppo.std, config.ppo.std_final)
         self.curriculum = Curriculum(config.reward_weights, config.penalty_warmup)
         self._t = 0  # steps of the present roll-out
 
@@ -66,7 +65,8 @@ class PPO(Algorithm):
 
     def _begin(self, state: State) -> None:
         """Begin a roll-out: schedules take their values for all of it."""
-        self.agent.actor.set_std(self.noise(self.share))
+        std, final = self.config.std, self.config.std_final
+        self.agent.actor.set_std(linear(std, final, self.share))
         self._weights = self.curriculum.at(self.share).vector()
         self._penalty = self.curriculum.penalty(self.share)
         self.rollout.begin(state)
@@ -101,10 +101,11 @@ class PPO(Algorithm):
             seen = distributed.gather(rollout.state["privileged"].flatten(0, 1))
             self.agent.observe(seen)
         figures = {f"loss/{name}": value for name, value in figures.items()}
-        figures["reward"] = float(learned_from.mean())
-        figures["penalty"] = self._penalty
-        figures["std"] = float(self.agent.actor.log_std.exp().mean())
-        return figures
+        return figures | {
+            "reward": float(learned_from.mean()),
+            "penalty": self._penalty,
+            "std": float(self.agent.actor.log_std.exp().mean()),
+        }
 
     def restart(self) -> None:
         """Forget the returns so far: every env begins a new episode."""
@@ -217,9 +218,8 @@ def ppo_loss(
     if now.named_position is not None:
         guess, truth = now.named_position, batch.state["named_position"]
         # The square up to 1 dm: objects that fall off the table are meters away.
-        terms["auxiliary"] = 2 * functional.huber_loss(
-            guess / DECIMETER, truth / DECIMETER
-        )
+        off = functional.huber_loss(guess / DECIMETER, truth / DECIMETER)
+        terms["auxiliary"] = 2 * off
         loss = loss + agent.config.auxiliary_weight * terms["auxiliary"]
     terms["kl"] = (ratio - 1 - log_ratio).mean()  # low-variance estimate, never < 0
     terms["clipped"] = ((ratio - 1).abs() > config.clip).float().mean()
@@ -237,11 +237,8 @@ def clip_gradient(agent: Agent, max_norm: float | None) -> Tensor:
     limit = float("inf") if max_norm is None else max_norm
     norm = nn.utils.clip_grad_norm_(agent.parameters(), limit)
     if not norm.isfinite():
-        gradients = {
-            name: weight.grad
-            for name, weight in agent.named_parameters()
-            if weight.grad is not None
-        }
+        named = agent.named_parameters()
+        gradients = {name: w.grad for name, w in named if w.grad is not None}
         check_finite(gradients, "gradient", "the learning rate is too high")
     return norm
 

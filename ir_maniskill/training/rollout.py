@@ -3,7 +3,7 @@
 Legend: T steps, N envs, S stacked observations, A numbers of an action, B steps drawn.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,20 +13,14 @@ from ir_maniskill.environment.senses import State
 from ir_maniskill.training import distributed
 
 
-@dataclass
-class Batch:
+class Batch(NamedTuple):
     """Steps drawn from the roll-outs, B of them."""
 
-    state: State
-    """s_t, each entry [B, ...]."""
-    action: Tensor
-    """a_t as sampled, not clipped [B, A]."""
-    log_prob: Tensor
-    """log pi(a_t|s_t) when it was sampled [B]."""
-    advantage: Tensor
-    """A_t [B]."""
-    returns: Tensor
-    """What the critic should have said [B]."""
+    state: State  # s_t, each entry [B, ...]
+    action: Tensor  # a_t as sampled, not clipped [B, A]
+    log_prob: Tensor  # log pi(a_t|s_t) when it was sampled [B]
+    advantage: Tensor  # A_t [B]
+    returns: Tensor  # what the critic should have said [B]
 
 
 class Frames:
@@ -100,23 +94,16 @@ class Rollout:
             self.frames.add(t, state["images"], self.done[t - 1])
 
     def add_outcome(self, t: int, reward: Tensor, done: Tensor, beyond: Tensor) -> None:
-        """Keep what step t led to.
+        """Keep what step t led to, all [N].
 
-        Args:
-            t: The step.
-            reward: r_t [N].
-            done: Whether the episode ended with this step [N].
-            beyond: Value of the last state of an ended episode, else 0 [N].
+        `done` are episodes that ended, `beyond` is the value of their last states.
         """
         self.reward[t], self.done[t], self.next_value[t] = reward, done, beyond
 
     def finish(self, last_value: Tensor, gamma: float, gae_lambda: float) -> None:
         """Turn rewards and values into advantages and returns.
 
-        Args:
-            last_value: Value of the states after the last step [N].
-            gamma: Discount.
-            gae_lambda: Decay of the advantage estimate.
+        `last_value` [N] is that of the states after the last step.
         """
         following = torch.cat([self.value[1:], last_value[None]])
         self.next_value = torch.where(self.done, self.next_value, following)

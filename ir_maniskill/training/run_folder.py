@@ -9,7 +9,7 @@ import logging
 import os
 import signal
 import threading
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -72,19 +72,13 @@ class RunFolder:
         return {**vars(self), "_lock": None, "_events": None}
 
     def read_last(self) -> Stored | None:
-        """Return the last checkpoint, if there is one.
-
-        Raises:
-            CheckpointError: If it is broken, or no complete checkpoint.
-        """
+        """Return the last checkpoint, if any; CheckpointError: it is broken."""
         if not self.last.exists():
             return None
         stored = checkpoint.read(self.last)
         if stored.kind != checkpoint.CHECKPOINT:
-            raise CheckpointError(
-                f"{self.last}: got a policy, expected a complete checkpoint to resume "
-                "from"
-            )
+            expected = "expected a complete checkpoint to resume from"
+            raise CheckpointError(f"{self.last}: got a policy, {expected}")
         return stored
 
     def begin(self, config: TrainConfig, steps: int) -> int:
@@ -93,9 +87,8 @@ class RunFolder:
         Returns:
             The steps of the last evaluation recorded; 0 if there is none.
         """
-        for pattern in (".*.tmp", ".[0-9]*.*"):  # what a process left when killed
-            for leftover in self.path.glob(pattern):
-                leftover.unlink()
+        for leftover in self.path.glob(".[0-9]*.*"):  # of a process that was killed
+            leftover.unlink()
         self._events = SummaryWriter(str(self.path), purge_step=steps + 1)
         self.write("config.json", (to_json(config) + "\n").encode())
         self._cut("metrics", steps)
@@ -119,9 +112,8 @@ class RunFolder:
         """Write the checkpoint of a run that has to stop."""
         with _undisturbed():
             checkpoint.write(self.last, snapshot)
-        log.warning(
-            "stopped at step %d: resume goes on there", snapshot.metadata["steps"]
-        )
+        steps = snapshot.metadata["steps"]
+        log.warning("stopped at step %d: resume goes on there", steps)
 
     def log(self, table: str, steps: int, figures: Mapping[str, float]) -> None:
         """Add a row to the CSV table, and a point to every TensorBoard curve."""
@@ -158,11 +150,7 @@ def _undisturbed() -> Iterator[None]:
 
 
 def stored_config(folder: Path) -> TrainConfig | None:
-    """Return the config of the run in a folder; None if there is no run.
-
-    Raises:
-        ConfigError: If it is none.
-    """
+    """Return the config of the run in a folder, if any; ConfigError: it is broken."""
     path = folder / "config.json"
     if not path.exists():
         return None
@@ -180,13 +168,9 @@ def whole_rows(table: Path) -> list[dict[str, str]]:
     return [row for row in rows if None not in row and None not in row.values()]
 
 
-def _format(rows: Iterable[Mapping[str, object]], *, header: bool) -> bytes:
+def _format(rows: Sequence[Mapping[str, object]], *, header: bool) -> bytes:
     """Return the lines of a CSV table."""
     text = io.StringIO(newline="")
-    for row in rows:
-        writer = csv.DictWriter(text, list(row))
-        if header:
-            writer.writeheader()
-            header = False
-        writer.writerow(row)
+    names = [list(row) for row in rows[:1] if header]
+    csv.writer(text).writerows(names + [list(row.values()) for row in rows])
     return text.getvalue().encode()

@@ -43,10 +43,9 @@ class Runner:
     """One run: the algorithm, its envs, and how far it has come.
 
     Scenes are reseeded from (seed, steps) at the start and after every checkpoint, so
-    that a run resumed there meets the same scenes as one that was never interrupted.
-    An evaluation has envs of its own and changes nothing. Several ranks have the scenes
-    of one with all envs. The first one's random states are in the checkpoint; the
-    others draw anew from (seed, steps, rank) after it.
+    that a run resumed there meets those of one that was never interrupted. Several
+    ranks have the scenes of one with all envs. The first one's random states are in the
+    checkpoint; the others draw anew from (seed, steps, rank) after it.
     """
 
     newest: Stored
@@ -60,17 +59,13 @@ class Runner:
         eval_envs: Callable[[], VectorEnv],
         algorithm: type[Algorithm],
     ) -> None:
-        """Make what is still untrained.
+        """Make what is still untrained; the config has the experiment's senses.
 
-        Args:
-            config: All numbers, with the senses and the vocabulary of the experiment.
-            folder: Where to keep what comes of it.
-            envs: This rank's share of the envs.
-            eval_envs: Returns the envs to evaluate in, always the same ones.
-            algorithm: What learns.
+        `envs` are this rank's share, `eval_envs` returns those to evaluate in, always
+        the same ones: an evaluation changes nothing.
         """
-        self.config, self.folder, self.envs = config, folder, envs
-        self.eval_envs = eval_envs
+        self.config, self.folder = config, folder
+        self.envs, self.eval_envs = envs, eval_envs
         self.device = distributed.device()
         self.stack, self.counts = StateStack(config.frames), StepCounts()
         self.steps, self.saved, self.evaluated = 0, 0, 0
@@ -98,14 +93,14 @@ class Runner:
             while True:
                 if self._evaluation_is_due():
                     self.evaluate()
-                    bar.set_postfix_str(_summary(figures) + self.said)
+                    bar.set_postfix_str(_shown(figures) + self.said)
                 if self._due(self.config.checkpoint_interval, self.saved):
                     self.save()
                 if self.steps >= total:
                     break
                 figures = self.advance()
                 self.newest = self.snapshot()
-                bar.set_postfix_str(_summary(figures) + self.said)
+                bar.set_postfix_str(_shown(figures) + self.said)
                 bar.update(self.steps - bar.n)
             self._write()
         distributed.from_first(self.confirm)
@@ -144,23 +139,17 @@ class Runner:
             info = info_of_step(info, done)
             self.state = self._here(self.stack.push(obs, done))
             self.counts.add(reward, done, info)
-            terms = info.get("reward_terms")
-            measured = {"reward": reward} if terms is None else {"reward terms": terms}
-            check_finite(measured, "outcome", "the simulation became unstable")
-            self.algorithm.observe(
-                Outcome(
-                    reward=reward.to(self.device),
-                    terms=None if terms is None else terms.to(self.device),
-                    terminated=terminated.to(self.device),
-                    truncated=truncated.to(self.device),
-                    state=self.state,
-                    final=final,
-                )
-            )
+            ends = {"terminated": terminated, "truncated": truncated}
+            paid = {"reward": reward}
+            if "reward_terms" in info:
+                paid["terms"] = info["reward_terms"]
+            check_finite(paid, "outcome", "the simulation became unstable")
+            here = self._here(paid | ends)
+            self.algorithm.observe(Outcome(**here, state=self.state, final=final))
         self.steps += self.config.num_envs
 
     def _here(self, state: State) -> State:
-        """Return the state on the learner's device."""
+        """Return tensors on the learner's device."""
         return {key: value.to(self.device) for key, value in state.items()}
 
     def _new_scenes(self) -> State:
@@ -183,23 +172,21 @@ class Runner:
         if distributed.rank() == 0:  # at last: what has no record is made again
             self.folder.log("evaluations", self.steps, figures)
         self.evaluated = self.steps
-        self.said = _said(self.steps, figures)
+        self.said = f" | policy at {self.steps}: {_shown(figures)}"
 
     def _evaluate(self) -> Figures:
-        report = self._report(
-            self.algorithm.agent, self.config.eval_episodes, EVAL_SEED
-        )
+        agent = self.algorithm.agent
+        report = self._report(agent, self.config.eval_episodes, EVAL_SEED)
         score = score_of(report, fingers=self.state["touch"].shape[2])
         if score > self.best_score:
             self.best_score = score
-            self._keep(self.algorithm.agent, self.steps, report)
+            self._keep(agent, self.steps, report)
         return figures_of(report)
 
     def confirm(self) -> None:
         """Evaluate the best policy on other scenes than those it was chosen by."""
         agent, _, metadata = checkpoint.load_agent(self.folder.best)
-        sentences = len(self.envs.experiment.sentences)
-        episodes = max(FINAL_EPISODES, sentences)
+        episodes = max(FINAL_EPISODES, len(self.envs.experiment.sentences))
         report = self._report(agent.to(self.device), episodes, FINAL_SEED)
         figures = self._keep(agent, metadata["steps"], report)
         text = json.dumps(figures, indent=2) + "\n"
@@ -332,8 +319,8 @@ class StepCounts:
 def score_of(report: EvaluationReport, fingers: int) -> float:
     """Return by what the best policy is chosen.
 
-    That is the sum of the worst sentence's success, the exclusive success, the share of
-    steps in which the goal holds, and that of the fingers which touch as it asks.
+    That sums the worst sentence's success, the exclusive success, the share of steps in
+    which the goal holds, and that of the fingers which touch as it asks.
     """
     figures = figures_of(report)
     held = figures["eval/holding"] + figures["eval/right_fingers"] / fingers
@@ -348,22 +335,22 @@ def figures_of(report: EvaluationReport) -> Figures:
     return {"eval/worst": worst} | {f"eval/{name}": overall[name] for name in names}
 
 
-def _summary(figures: Figures) -> str:
-    """Return what the progress bar says of the last update."""
-    names = {"train/return": "return {:.2f}", "train/success": "success {:.0%}"}
-    names |= {"penalty": "penalties {:.0%}", "std": "noise {:.2f}"}
-    told = (
-        form.format(figures[name]) for name, form in names.items() if name in figures
-    )
-    return ", ".join(told)
+SHOWN = {
+    "train/return": "return {:.2f}",
+    "train/success": "success {:.0%}",
+    "penalty": "penalties {:.0%}",
+    "std": "noise {:.2f}",
+    "eval/success": "success {:.0%}",
+    "eval/exclusive": "exclusive {:.0%}",
+    "eval/holding": "holding {:.0%}",
+    "eval/right_fingers": "{:.1f} fingers",
+}
+"""Figures that the progress bar shows, and how."""
 
 
-def _said(steps: int, figures: Figures) -> str:
-    """Return what the progress bar says of the last evaluation."""
-    names = ("success", "exclusive", "holding")
-    shares = ", ".join(f"{name} {figures[f'eval/{name}']:.0%}" for name in names)
-    fingers = figures["eval/right_fingers"]
-    return f" | policy at {steps}: {shares}, {fingers:.1f} fingers"
+def _shown(figures: Figures) -> str:
+    """Return what the progress bar says of figures."""
+    return ", ".join(SHOWN[k].format(figures[k]) for k in SHOWN if k in figures)
 
 
 def _entropy(*numbers: int) -> int:

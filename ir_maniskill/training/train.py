@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -49,9 +48,7 @@ def train(
     Args:
         task: Id of the task, or the whole configuration of the training.
         resume: Go on from the folder's last checkpoint, if there is one, with the
-            folder's own config. Of `changes`, or of what a configuration given has
-            other than `TrainConfig()`, the budget, the intervals and what it is
-            computed on may differ from that.
+            folder's own config; of what is given only `MAY_CHANGE` may differ from it.
         envs: Vector of this rank's envs to use (and leave open) instead of making one.
         eval_envs: The same for evaluations, which only the first rank makes.
         algorithm: What learns.
@@ -60,9 +57,8 @@ def train(
 
     Raises:
         CheckpointError: If the folder or its checkpoint cannot be used.
-        ConfigError: If the run was begun with another config, the envs cannot be shared
-            evenly among the ranks, those given are others than the config says, or an
-            evaluation has too few episodes.
+        ConfigError: If the run was begun with another config, or the envs, their number
+            or that of the episodes do not fit.
         OSError: If the folder cannot be written to.
         RankError: If another rank failed.
         TrainingDivergedError: If a number stopped being finite.
@@ -109,8 +105,18 @@ def run(
             envs = make_envs(config, config.num_envs // distributed.size())
             leaving.callback(envs.close)
         _require_fit(config, envs)
-        evaluation = _lent(eval_envs) if eval_envs else _made_later(config, leaving)
-        runner = Runner(config, folder, envs, evaluation, algorithm)
+
+        @functools.cache
+        def evaluated_in() -> VectorEnv:
+            """Return the envs to evaluate in, made when they are first asked for."""
+            if eval_envs is not None:
+                return eval_envs
+            count = min(config.num_envs, config.eval_episodes)
+            made = make_envs(config, count, training=False)
+            leaving.callback(made.close)
+            return made
+
+        runner = Runner(config, folder, envs, evaluated_in, algorithm)
         if stored is not None:
             runner.restore(stored)
         runner.learn()
@@ -119,45 +125,33 @@ def run(
 
 def for_experiment(config: TrainConfig, experiment: Experiment) -> TrainConfig:
     """Return the config with what the experiment decides: senses and vocabulary."""
-    senses = config.agent.senses or experiment.senses
-    words = experiment.vocabulary
+    senses, words = config.agent.senses or experiment.senses, experiment.vocabulary
     agent = dataclasses.replace(config.agent, senses=senses, vocabulary=words)
     return dataclasses.replace(config, agent=agent)
 
 
 def _require_shares(config: TrainConfig) -> None:
     """Raise unless every rank gets equal parts of the envs and of each minibatch."""
-    ranks, minibatch = distributed.size(), config.ppo.minibatch
-    if config.num_envs % ranks:
-        raise ConfigError(
-            f"num_envs: got {config.num_envs}, expected a multiple of {ranks}: the "
-            "ranks share them"
-        )
-    if minibatch is not None and minibatch < ranks:
-        raise ConfigError(
-            f"minibatch: got {minibatch}, expected at least {ranks}: the ranks share it"
-        )
+    ranks, envs, batch = distributed.size(), config.num_envs, config.ppo.minibatch
+    shared = f"a multiple of {ranks}: the ranks share them"
+    require(envs % ranks == 0, "num_envs", envs, shared)
+    fits = batch is None or batch >= ranks
+    require(fits, "minibatch", batch, f"at least {ranks}: the ranks share it")
 
 
 def _require_fit(config: TrainConfig, envs: VectorEnv) -> None:
     """Raise unless the envs are those of the config, and it evaluates them wholly."""
     task, share = envs.experiment.id, config.num_envs // distributed.size()
-    if task != config.env_id:
-        raise ConfigError(
-            f"env_id: got {config.env_id!r}, expected {task!r}, the task of the envs "
-            "given; change it, or make envs of that task"
-        )
+    expected = f"{task!r}, the task of the envs given"
+    require(config.env_id == task, "env_id", config.env_id, expected)
     if envs.num_envs != share:
         raise ConfigError(
             f"num_envs: got a vector of {envs.num_envs} envs, expected {share}, which "
             f"is this rank's share of {config.num_envs}; change one of them"
         )
-    sentences = len(envs.experiment.sentences)
-    if config.eval_episodes < sentences:
-        raise ConfigError(
-            f"eval_episodes: got {config.eval_episodes}, expected at least "
-            f"{sentences}, one for each sentence"
-        )
+    episodes, sentences = config.eval_episodes, len(envs.experiment.sentences)
+    expected = f"at least {sentences}, one for each sentence"
+    require(episodes >= sentences, "eval_episodes", episodes, expected)
 
 
 def make_envs(config: TrainConfig, count: int, *, training: bool = True) -> VectorEnv:
@@ -175,23 +169,3 @@ def make_envs(config: TrainConfig, count: int, *, training: bool = True) -> Vect
         render_backend=render_backend,
         **kwargs,
     )
-
-
-def _lent(envs: VectorEnv) -> Callable[[], VectorEnv]:
-    """Return what gives these envs."""
-    return lambda: envs
-
-
-def _made_later(
-    config: TrainConfig, leaving: contextlib.ExitStack
-) -> Callable[[], VectorEnv]:
-    """Return what makes envs to evaluate in when they are first asked for."""
-
-    @functools.cache
-    def make() -> VectorEnv:
-        count = min(config.num_envs, config.eval_episodes)
-        envs = make_envs(config, count, training=False)
-        leaving.callback(envs.close)
-        return envs
-
-    return make
