@@ -9,7 +9,7 @@ import gymnasium as gym
 import tyro
 
 from ir_maniskill import Experiment, Instruction, Ref, Touch, TouchObject, register
-from ir_maniskill.experiment import VOCABULARY
+from ir_maniskill.language.tokens import VOCABULARY
 from ir_maniskill.training.config import TrainConfig
 from ir_maniskill.training.train import train
 

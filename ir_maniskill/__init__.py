@@ -24,13 +24,12 @@ from ir_maniskill.api import evaluate, record
 from ir_maniskill.environment.vector import make_vec
 from ir_maniskill.experiment import (
     Experiment,
-    Instruction,
     Jitter,
     TouchObject,
     available,
     touch_instructions,
 )
-from ir_maniskill.goals import Avoid, Both, Goal, Push, Ref, Then, Touch
+from ir_maniskill.goals import Avoid, Both, Goal, Instruction, Push, Ref, Then, Touch
 from ir_maniskill.policy import Policy, load_policy
 from ir_maniskill.registration import register
 from ir_maniskill.training.train import train

@@ -21,7 +21,7 @@ from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.robots.robot import Robot, available_robots, short_name
 from ir_maniskill.evaluation import plots
 from ir_maniskill.evaluation.evaluate import EVALUATION_SEED, write_report
-from ir_maniskill.experiment import Experiment
+from ir_maniskill.experiment import Drawn, Experiment, Spoken
 from ir_maniskill.files import require_writable, write_json
 from ir_maniskill.policy import load_policy, shipped
 from ir_maniskill.training import distributed
@@ -325,18 +325,25 @@ def _describe_robot(robot: type[Robot]) -> tuple[str, str, str, str, str]:
 
 def _describe(experiment: Experiment) -> tuple[str, str, str, str, str]:
     """Return the row of an experiment in the table of tasks."""
-    sentences = experiment.sentences
-    more = f" (+{len(sentences) - 1})" if len(sentences) > 1 else ""
-    colors = ", ".join(thing.color for thing in experiment.objects)
-    places = "shuffled" if experiment.shuffled else "in place"
+    drawn, spoken = experiment.objects, experiment.instructions
+    if isinstance(drawn, Drawn):
+        low, high = drawn.count
+        things = f"{low} to {high} of {len(drawn.pool)}; anywhere in reach"
+    else:
+        colors = ", ".join(thing.color for thing in drawn)
+        things = f"{colors}; {'shuffled' if experiment.shuffled else 'in place'}"
+    if isinstance(spoken, Spoken):
+        said = f"the language: {', '.join(spoken.kinds)}"
+    else:
+        said = spoken[0].text + f" (+{len(spoken) - 1})" * (len(spoken) > 1)
     reward = {"binary": "+1 if touched", "per_finger": "+1 a finger"}
     penalty = (
         f", -{experiment.wrong_penalty:g} wrong" if experiment.wrong_penalty else ""
     )
     return (
         experiment.id,
-        sentences[0] + more,
-        f"{colors}; {places}",
+        said,
+        things,
         reward[experiment.reward] + penalty,
         ", ".join(experiment.senses),
     )

@@ -8,42 +8,30 @@ from __future__ import annotations
 
 import importlib
 import itertools
-import logging
 import math
 import os
 import re
 import sys
-import unicodedata
 from collections.abc import Iterable
-from dataclasses import dataclass, field
-from functools import lru_cache, partial
+from dataclasses import dataclass, field, replace
+from functools import partial
 from numbers import Integral, Real
 from typing import Any, Literal
 
 import torch
 
 from ir_maniskill import checks
-from ir_maniskill.goals import COLORS, SHAPES, Goal, GoalError, Ref, Touch
-from ir_maniskill.snapshot import Snapshot
-
-log = logging.getLogger(__name__)
-
-VOCABULARY = (
-    "<pad>",
-    "<unk>",
-    ".",
-    "touch",
-    "the",
-    "blue",
-    "red",
-    "green",
-    "cube",
-    "button",
+from ir_maniskill.goals import COLORS, SHAPES, GoalError, Instruction, Ref, Touch
+from ir_maniskill.language import words as words_of_language
+from ir_maniskill.language.splits import KINDS, SPLITS
+from ir_maniskill.language.tokens import (
+    VOCABULARY,
+    split_words,
+    tokenize,
+    warn_of_unknown,
+    words_of,
 )
-"""The ten tokens of the paper's vocabulary; a token's id is its place here."""
-
-PAD, UNK = 0, 1
-"""Ids of `<pad>`, which fills short sentences up, and of `<unk>`, any other word."""
+from ir_maniskill.snapshot import Snapshot
 
 SENSES = ("vision", "proprioception", "touch")
 """The sensory modules that the Perceptual System may use."""
@@ -101,18 +89,100 @@ class TouchObject:
         return f"{self.color} {self.shape}"
 
 
-@dataclass(frozen=True)
-class Instruction:
-    """An instruction i_t and the goal that it asks for."""
+Area = tuple[tuple[float, float], tuple[float, float]]
+"""Bounds along x and y, (low, high) each [m]."""
 
-    text: str
-    """The sentence."""
-    goal: Goal
-    """What it asks for, e.g. `Touch(Ref("blue", "cube"))`."""
+
+@dataclass(frozen=True)
+class Drawn:
+    """Objects that are drawn anew for every episode: which, and where they lie.
+
+    No two are alike, and each lies where an arm of the robot reaches it.
+
+    Raises:
+        ExperimentError: A field is malformed, or so many objects cannot be there.
+    """
+
+    count: tuple[int, int] = (2, 5)
+    """The fewest and the most."""
+    colors: tuple[str, ...] = tuple(COLORS)
+    """Keys of `COLORS`."""
+    shapes: tuple[str, ...] = SHAPES
+    """Some of `SHAPES`."""
+    area: Area = ((0.14, 0.26), (-0.15, 0.15))
+    """Where their centers may be [m]."""
+    apart: float = 0.065
+    """Least distance between their centers [m]."""
+    held_out: Area = ((0.14, 0.26), (0.03, 0.07))
+    """Where something may lie, but is never named, but for the split `places` [m]."""
 
     def __post_init__(self) -> None:
-        _require_type("instruction text", self.text, str)
-        _require_type("instruction goal", self.goal, Goal)
+        for name, known in (("colors", COLORS), ("shapes", SHAPES)):
+            _require_tuple(f"drawn {name}", getattr(self, name), str)
+            for value in getattr(self, name):
+                _require_choice(f"drawn {name}", value, known)
+        _require_tuple("drawn count", self.count, Integral)
+        most = len(self.pool)
+        valid = len(self.count) == 2 and 1 <= self.count[0] <= self.count[1] <= most
+        _require(valid, "drawn count", self.count, f"(fewest, most), 1 to {most}")
+        diagonal = round(OBJECT_SIZE * math.sqrt(2), 3)
+        _require_number("drawn apart", self.apart, diagonal, 1)
+        for name in ("area", "held_out"):
+            self._require_on_table(name)
+        self._require_room()
+
+    @property
+    def pool(self) -> tuple[TouchObject, ...]:
+        """All that may be drawn; their places mean nothing."""
+        middle = sum(TABLE[0]) / 2, sum(TABLE[1]) / 2
+        kinds = itertools.product(self.colors, self.shapes)
+        return tuple(TouchObject(color, middle, shape) for color, shape in kinds)
+
+    def is_held_out(self, x: float, y: float) -> bool:
+        """Return whether a place is in the part that is held out [m]."""
+        bounds = zip((x, y), self.held_out, strict=True)
+        return all(low <= value <= high for value, (low, high) in bounds)
+
+    def _require_on_table(self, name: str) -> None:
+        area, margin = getattr(self, name), OBJECT_SIZE / math.sqrt(2)
+        inside = all(
+            low + margin <= first <= last <= high - margin
+            for (first, last), (low, high) in zip(area, TABLE, strict=True)
+        )
+        expected = f"bounds (low, high) of x and y, {margin:.3f} m within {TABLE}"
+        _require(inside, f"drawn {name}", area, expected)
+
+    def _require_room(self) -> None:
+        """Raise if the most objects fill more than a third of the area."""
+        (x0, x1), (y0, y1) = self.area
+        room = (x1 - x0 + self.apart) * (y1 - y0 + self.apart)
+        most = int(room / (3 * math.pi * (self.apart / 2) ** 2))
+        expected = f"at most {most} objects in this area, {self.apart} m apart"
+        _require(self.count[1] <= most, "drawn count", self.count, expected)
+
+
+@dataclass(frozen=True)
+class Spoken:
+    """Sentences of the instruction language, drawn anew for every scene.
+
+    Raises:
+        ExperimentError: There is no such kind or split.
+    """
+
+    kinds: tuple[str, ...] = KINDS
+    """Kinds of sentences, each as likely as the others where the scene allows it."""
+    split: str = "train"
+    """One of `SPLITS`: what is held out of the others."""
+
+    MAX_TOKENS = 40
+    """Most words and full stops of a sentence."""
+
+    def __post_init__(self) -> None:
+        _require_tuple("kinds", self.kinds, str)
+        _require(self.kinds != (), "kinds", (), f"some of {KINDS}")
+        for kind in self.kinds:
+            _require_choice("kind", kind, KINDS)
+        _require_choice("split", self.split, SPLITS)
 
 
 @dataclass(frozen=True)
@@ -147,9 +217,9 @@ class Experiment:
 
     id: str
     """Id for `gym.make`, e.g. "NaoTouchCubeSingle-v1"."""
-    objects: tuple[TouchObject, ...]
+    objects: tuple[TouchObject, ...] | Drawn
     """What lies on the table."""
-    instructions: tuple[Instruction, ...]
+    instructions: tuple[Instruction, ...] | Spoken
     """The Instructional Set; one is drawn for every episode."""
     reward: RewardKind = "binary"
     """"binary": 1 while the goal holds (experiments I and II); "per_finger": its level,
@@ -180,20 +250,56 @@ class Experiment:
         _require_tuple("senses", self.senses, str)
         for sense in self.senses:
             _require_choice("sense", sense, SENSES)
-        _require_tuple("objects", self.objects, TouchObject)
-        _require_tuple("instructions", self.instructions, Instruction)
+        if not isinstance(self.objects, Drawn):
+            _require_tuple("objects", self.objects, TouchObject)
+        if not isinstance(self.instructions, Spoken):
+            _require_tuple("instructions", self.instructions, Instruction)
         if self.vocabulary == ():
-            object.__setattr__(self, "vocabulary", words_of(self.sentences))
+            spoken = isinstance(self.instructions, Spoken)
+            words = words_of_language() if spoken else words_of(self.sentences)
+            object.__setattr__(self, "vocabulary", words)
         self._check_vocabulary()
         for sentence in self.sentences:
             warn_of_unknown(sentence, self.vocabulary)
+        self._check_objects()
         self._check_instructions()
-        self._check_layout()
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """The sentences of the Instructional Set, in order."""
+        """The sentences of the Instructional Set, in order; none if they are spoken."""
+        if isinstance(self.instructions, Spoken):
+            return ()
         return tuple(instruction.text for instruction in self.instructions)
+
+    @property
+    def bodies(self) -> tuple[TouchObject, ...]:
+        """All objects that may lie on the table."""
+        return self.objects.pool if isinstance(self.objects, Drawn) else self.objects
+
+    @property
+    def slots(self) -> int:
+        """How many objects lie on the table at most: C."""
+        if isinstance(self.objects, Drawn):
+            return self.objects.count[1]
+        return len(self.objects)
+
+    @property
+    def max_tokens(self) -> int:
+        """Most words and full stops that a sentence may have: L."""
+        if isinstance(self.instructions, Spoken):
+            return Spoken.MAX_TOKENS
+        return max(len(split_words(sentence)) for sentence in self.sentences)
+
+    def in_split(self, split: str) -> Experiment:
+        """Return the same with the sentences and places of another split.
+
+        Raises:
+            ExperimentError: There is no such split, or the sentences are not spoken.
+        """
+        if isinstance(self.instructions, Spoken):
+            return replace(self, instructions=replace(self.instructions, split=split))
+        _require(split == "train", f"split of {self.id}", split, "'train': it has none")
+        return self
 
     def _check_vocabulary(self) -> None:
         _require_tuple("vocabulary", self.vocabulary, str)
@@ -204,10 +310,21 @@ class Experiment:
             itself = tokenize(word, self.vocabulary) == [index]
             _require(itself, "vocabulary", word, expected)
 
-    def _check_instructions(self) -> None:
+    def _check_objects(self) -> None:
+        if isinstance(self.objects, Drawn):
+            spoken, shuffled = isinstance(self.instructions, Spoken), self.shuffled
+            expected = "Spoken(...), as the objects are drawn"
+            _require(spoken, "instructions", self.instructions, expected)
+            _require(not shuffled, "shuffled", shuffled, "False: objects are drawn")
+            return
         names = [thing.name for thing in self.objects]
         distinct = 0 < len(names) == len(set(names))
         _require(distinct, "objects", names, "at least one and no two alike")
+        self._check_layout(self.objects)
+
+    def _check_instructions(self) -> None:
+        if isinstance(self.instructions, Spoken):
+            return
         _require(self.instructions != (), "instructions", (), "at least one")
         said: dict[tuple[int, ...], Instruction] = {}
         for instruction in self.instructions:
@@ -225,7 +342,7 @@ class Experiment:
 
     def _check_refs(self, instruction: Instruction) -> None:
         """Raise unless each reference fits one object, as far as the layout says."""
-        layout = _layout(self.objects)
+        layout = scene_of(self.bodies)
         for ref in instruction.goal.refs:
             fits = int(ref.resolve(layout).sum())
             unknown = self.shuffled and ref.where is not None  # told at each reset
@@ -233,12 +350,12 @@ class Experiment:
                 fits == 1 or unknown,
                 f"instruction {instruction.text!r}: objects that {ref} fits",
                 fits,
-                "exactly one of: " + ", ".join(thing.name for thing in self.objects),
+                "exactly one of: " + ", ".join(thing.name for thing in self.bodies),
             )
 
-    def _check_layout(self) -> None:
+    def _check_layout(self, objects: tuple[TouchObject, ...]) -> None:
         slack = self.jitter.position * math.sqrt(2)
-        for thing in self.objects:
+        for thing in objects:
             margin = OBJECT_SIZE / math.sqrt(2) + self.jitter.position
             for value, (low, high) in zip(thing.position, TABLE, strict=True):
                 if not low + margin <= value <= high - margin:
@@ -246,7 +363,7 @@ class Experiment:
                         f"{thing.name} at {thing.position}: not wholly on the table, "
                         f"which spans x {TABLE[0]} and y {TABLE[1]} m"
                     )
-        for a, b in itertools.combinations(self.objects, 2):
+        for a, b in itertools.combinations(objects, 2):
             gap = math.dist(a.position, b.position) - 2 * slack
             if gap < OBJECT_SIZE * math.sqrt(2):
                 raise ExperimentError(
@@ -254,42 +371,6 @@ class Experiment:
                     f"{gap:.3f} m with jitter, expected at least "
                     f"{OBJECT_SIZE * math.sqrt(2):.3f} m"
                 )
-
-
-def tokenize(sentence: str, vocabulary: tuple[str, ...] = VOCABULARY) -> list[int]:
-    """Return the ids of a sentence's words and full stops: places in the vocabulary.
-
-    Case does not matter, unknown words become `<unk>`.
-    """
-    ids = {word: index for index, word in enumerate(vocabulary)}
-    return [ids.get(word, UNK) for word in split_words(sentence)]
-
-
-@lru_cache(1000)
-def warn_of_unknown(sentence: str, vocabulary: tuple[str, ...]) -> None:
-    """Log, once for each sentence, which of its words are read as `<unk>`."""
-    unknown = [word for word in split_words(sentence) if word not in vocabulary]
-    if unknown:
-        log.warning("%r: not in the vocabulary: %s", sentence, ", ".join(unknown))
-
-
-def split_words(sentence: str) -> list[str]:
-    """Return the words and full stops of a sentence, in lower case.
-
-    Letters of any script count, with the marks that belong to them.
-    """
-    text = unicodedata.normalize("NFC", sentence.lower()).replace(".", " . ")
-    parts = (
-        c if c.isalnum() or c == "." or unicodedata.category(c)[0] == "M" else " "
-        for c in text
-    )
-    return "".join(parts).split()
-
-
-def words_of(sentences: Iterable[str]) -> tuple[str, ...]:
-    """Return the vocabulary of the sentences: `<pad>`, `<unk>` and their words."""
-    words = (word for text in sentences for word in split_words(text))
-    return (*VOCABULARY[:2], *dict.fromkeys(words))
 
 
 def touch_instructions(objects: Iterable[TouchObject]) -> tuple[Instruction, ...]:
@@ -300,7 +381,7 @@ def touch_instructions(objects: Iterable[TouchObject]) -> tuple[Instruction, ...
     )
 
 
-def _layout(objects: Iterable[TouchObject]) -> Snapshot:
+def scene_of(objects: Iterable[TouchObject]) -> Snapshot:
     """Return a snapshot that knows only what lies where [1, ...]."""
     things = tuple(objects)
     poses = torch.tensor([[*o.position, 0, 1, 0, 0, 0] for o in things]).float()[None]

@@ -43,8 +43,11 @@ COLORS: dict[str, tuple[float, float, float]] = {
 }
 """Linear RGB of every color an object may have."""
 
-SHAPES = ("cube", "button")
-"""A cube is a free 4 cm body, a button is fixed to the table."""
+SHAPES = ("cube", "button", "can", "pyramid")
+"""Bodies of some 4 cm; all but `FIXED` are free."""
+
+FIXED = ("button",)
+"""Shapes that stay where they are put."""
 
 DIRECTIONS = {
     "left": (0.0, 1.0, 0.0),
@@ -382,3 +385,17 @@ class Then(Goal):
 
 def _is_sequence(goal: Goal) -> bool:
     return isinstance(goal, Then) or any(map(_is_sequence, goal.parts))
+
+
+@dataclass(frozen=True)
+class Instruction:
+    """An instruction i_t and the goal that it asks for."""
+
+    text: str
+    """The sentence."""
+    goal: Goal
+    """What it asks for, e.g. `Touch(Ref("blue", "cube"))`."""
+
+    def __post_init__(self) -> None:
+        _require_type("instruction text", self.text, str)
+        _require_type("instruction goal", self.goal, Goal)

@@ -20,7 +20,8 @@ from ir_maniskill.environment.senses import (
     text_of,
     tokens_of,
 )
-from ir_maniskill.experiment import Experiment, warn_of_unknown
+from ir_maniskill.experiment import Experiment
+from ir_maniskill.language.tokens import split_words, warn_of_unknown
 from ir_maniskill.training.checkpoint import (
     CheckpointError,
     MismatchError,
@@ -101,7 +102,8 @@ class Policy:
         if "instruction" in self.agent.encoder.language.reads:
             for sentence in sentences:
                 warn_of_unknown(sentence, self.vocabulary)
-        tokens = tokens_of(sentences, self.vocabulary)
+        longest = max(len(split_words(sentence)) for sentence in sentences)
+        tokens = tokens_of(sentences, self.vocabulary, longest)
         return {"instruction": tokens, "text": text_of(sentences)}
 
     def require_match(

@@ -1,5 +1,5 @@
 """The paper's experiments and ours, one short file each; importing registers them."""
 
-from ir_maniskill.tasks import single, multi, triangle, shuffled  # noqa: I001
+from ir_maniskill.tasks import single, multi, triangle, shuffled, instruct  # noqa: I001
 
-__all__ = ["multi", "shuffled", "single", "triangle"]
+__all__ = ["instruct", "multi", "shuffled", "single", "triangle"]

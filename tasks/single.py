@@ -1,6 +1,7 @@
 """Experiment I: three objects in a line, one instruction (paper, Sec. IV-A)."""
 
-from ir_maniskill.experiment import VOCABULARY, Experiment, touch_instructions
+from ir_maniskill.experiment import Experiment, touch_instructions
+from ir_maniskill.language.tokens import VOCABULARY
 from ir_maniskill.registration import register
 from ir_maniskill.tasks.layouts import line
 

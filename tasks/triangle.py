@@ -1,6 +1,7 @@
 """Experiment III: triangle, proprioception, reward per finger (paper, Sec. IV-C)."""
 
-from ir_maniskill.experiment import VOCABULARY, Experiment, touch_instructions
+from ir_maniskill.experiment import Experiment, touch_instructions
+from ir_maniskill.language.tokens import VOCABULARY
 from ir_maniskill.registration import register
 from ir_maniskill.tasks import layouts
 

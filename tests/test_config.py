@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ir_maniskill.environment.reward_generator import RewardWeights
-from ir_maniskill.experiment import VOCABULARY
+from ir_maniskill.language.tokens import VOCABULARY
 from ir_maniskill.training import checkpoint
 from ir_maniskill.training.config import (
     CONFIGS,

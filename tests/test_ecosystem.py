@@ -21,7 +21,7 @@ from mani_skill.utils.wrappers import (
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 from ir_maniskill import Experiment, Instruction, Ref, Touch, TouchObject, register
-from ir_maniskill.experiment import VOCABULARY
+from ir_maniskill.language.tokens import VOCABULARY
 
 STEPS = 16
 """Actions of each recorded episode."""

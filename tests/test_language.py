@@ -7,7 +7,6 @@ from random import Random
 import pytest
 import torch
 
-from ir_maniskill.experiment import split_words
 from ir_maniskill.goals import (
     COLORS,
     DIRECTIONS,
@@ -43,6 +42,7 @@ from ir_maniskill.language import (
     words,
 )
 from ir_maniskill.language.grammar import RULES
+from ir_maniskill.language.tokens import split_words
 from ir_maniskill.snapshot import Snapshot
 
 RED, BLUE = Ref("red"), Ref("blue", "cube")

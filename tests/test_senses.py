@@ -119,7 +119,7 @@ def test_the_simulators_state_is_there_only_when_asked_for() -> None:
 def test_text_comes_back_from_its_bytes() -> None:
     said = ["Touch the blue cube.", "Toque o cubo verde, à esquerda.", ""]
     rows = senses.text_of(said)
-    assert rows.dtype == torch.uint8 and rows.shape == (3, 32)
+    assert rows.dtype == torch.uint8 and rows.shape == (3, 256)
     assert senses.read_text(rows) == said
 
 

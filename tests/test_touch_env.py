@@ -129,7 +129,7 @@ def test_the_sentence_its_tokens_and_its_object_belong_together(env: gym.Env) ->
         words = [catalog.VOCABULARY[token] for token in obs["extra"]["instruction"][0]]
         assert words == instruction.text.lower().replace(".", " .").split()
     for wrong in (3, True, 1.5, "Touch the sky.", [0, 0], float):
-        with pytest.raises(ValueError, match="'instruction': got .* expected an index"):
+        with pytest.raises(ValueError, match="instruction: got .* expected an index"):
             env.reset(options={"instruction": wrong})
 
 

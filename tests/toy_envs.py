@@ -7,7 +7,7 @@ import torch
 from gymnasium.spaces import Box
 
 from ir_maniskill.agent import StateSpec
-from ir_maniskill.experiment import VOCABULARY
+from ir_maniskill.language.tokens import VOCABULARY
 from ir_maniskill.training.config import AgentConfig, PPOConfig, TrainConfig
 
 LENGTH = 8  # steps of an episode

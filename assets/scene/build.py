@@ -1,4 +1,4 @@
-"""Builds `room.glb` and `button.glb`: `python -m ir_maniskill.assets.scene.build`.
+"""Builds the meshes beside it: `python -m ir_maniskill.assets.scene.build`.
 
 The room (table, floor, wall) is one mesh with one material, hence one draw call.
 """
@@ -26,8 +26,16 @@ SKIRTING_HEIGHT = 0.05
 """Height of the skirting board [m]."""
 BUTTON_PROFILE = ((-0.012, 0.020), (0.006, 0.020), (0.011, 0.016), (0.012, 0.0))
 """(height, radius) of the button from the foot up, about its center [m]."""
-BUTTON_SEGMENTS = 12
-"""Points per ring of the button."""
+CAN_PROFILE = ((-0.0275, 0.0), (-0.0275, 0.020), (0.0275, 0.020))
+"""(height, radius) of the can's side, about its center [m]."""
+LID_PROFILE = ((0.0275, 0.020), (0.0275, 0.0))
+"""The same of its lid."""
+SEGMENTS = 12
+"""Points per ring of what is round."""
+PYRAMID_EDGE, PYRAMID_HEIGHT = 0.044, 0.050
+"""[m]"""
+TIP = 0.4
+"""Share of the pyramid's height that is its tip."""
 
 TOP, EDGE, LEG, FLOOR, WALL, SKIRTING = range(6)
 PALETTE = (
@@ -80,20 +88,47 @@ def room() -> Surface:
     return join(parts)
 
 
-def button() -> trimesh.Trimesh:
-    """Return a round button that stands upright; its color is given at load."""
-    sections = [Section(at, (radius, radius), 0) for at, radius in BUTTON_PROFILE]
-    surface = loft("x", BUTTON_SEGMENTS, sections).turned(0, -np.pi / 2, 0)
-    mesh = bake(surface, ((255, 255, 255),), _LIGHT)
-    return trimesh.Trimesh(
-        mesh.vertices, mesh.faces, vertex_normals=mesh.vertex_normals, process=False
-    )
+def turned(profile: tuple[tuple[float, float], ...]) -> trimesh.Trimesh:
+    """Return a round body that stands upright; its color is given at load."""
+    sections = [Section(at, (radius, radius), 0) for at, radius in profile]
+    return _plain(loft("x", SEGMENTS, sections).turned(0, -np.pi / 2, 0))
+
+
+def pyramid(low: float, high: float) -> trimesh.Trimesh:
+    """Return a slice of the pyramid, between shares of its height."""
+    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * PYRAMID_EDGE / 2
+    rings = [
+        np.column_stack([corners * (1 - at), np.full(4, PYRAMID_HEIGHT * (at - 0.5))])
+        for at in (low, high)
+    ]
+    return _plain(trimesh.convex.convex_hull(np.vstack(rings)))
+
+
+def _plain(mesh: Surface | trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return the mesh without colors, so that the one given at load is its own."""
+    if isinstance(mesh, Surface):
+        mesh = bake(mesh, ((255, 255, 255),), _LIGHT)
+        normals = mesh.vertex_normals
+        return trimesh.Trimesh(
+            mesh.vertices, mesh.faces, vertex_normals=normals, process=False
+        )
+    mesh.unmerge_vertices()  # flat faces
+    return mesh
 
 
 def main() -> None:
     """Write the meshes beside this file."""
     bake(room(), PALETTE, _LIGHT).export(FOLDER / "room.glb")
-    button().export(FOLDER / "button.glb")
+    meshes = {
+        "button": turned(BUTTON_PROFILE),
+        "can": turned(CAN_PROFILE),
+        "can_top": turned(LID_PROFILE),
+        "pyramid": pyramid(0, 1 - TIP),
+        "pyramid_top": pyramid(1 - TIP, 1),
+        "pyramid_hull": pyramid(0, 1),
+    }
+    for name, mesh in meshes.items():
+        mesh.export(FOLDER / f"{name}.glb")
 
 
 if __name__ == "__main__":

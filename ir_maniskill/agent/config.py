@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from ir_maniskill.checks import require, require_choices, require_fields
 from ir_maniskill.environment.senses import available
-from ir_maniskill.experiment import VOCABULARY
+from ir_maniskill.language.tokens import VOCABULARY
 
 Vision = Literal["patches", "paper"]
 CriticInput = Literal["asymmetric", "separate"]

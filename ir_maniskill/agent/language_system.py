@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from ir_maniskill.agent.config import AgentConfig
 from ir_maniskill.checks import require
-from ir_maniskill.experiment import PAD
+from ir_maniskill.language.tokens import PAD
 
 LAYERS, HEADS, WIDTH = 3, 2, 50
 """Of the paper's transformer: its layers, their heads, and D."""

@@ -10,6 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ir_maniskill.experiment import Experiment
+from ir_maniskill.goals import Instruction
+from ir_maniskill.language import SentenceError, parse
+
 RESET_OPTIONS = ("instruction", "reconfigure", "reset_to_env_states")
 """Names of the options that a reset of all envs takes."""
 
@@ -33,32 +37,55 @@ def seeds_of(seed: int | Sequence[int], num_envs: int) -> list[int]:
     )
 
 
-def instruction_indices(
-    given: Any, sentences: Sequence[str], num_envs: int
-) -> list[int]:
-    """Return the index of each env's sentence: one, or its text, for all, or N of them.
+def instructions_of(
+    given: Any, experiment: Experiment, num_envs: int
+) -> list[Instruction]:
+    """Return what each env is told: one instruction for all, or N of them.
+
+    Each is an `Instruction`, an index or a sentence of the experiment's own, or another
+    sentence that the instruction language understands.
 
     Raises:
-        ValueError: It is something else, or there is no such sentence.
+        ValueError: It is something else, or a sentence that is not understood.
     """
-    given = _plain(given)
+    given, hint = _plain(given), ""
     each = given if isinstance(given, list) else [given] * num_envs
-    indices = [sentences.index(one) if one in sentences else one for one in each]
-    if len(indices) == num_envs and _all_in(range(len(sentences)), indices):
-        return indices
+    try:
+        found = [_instruction(one, experiment) for one in each]
+        if len(found) == num_envs:
+            return found
+    except SentenceError as error:
+        hint = f" ({error})"
+    except LookupError:
+        pass
+    own = experiment.sentences
+    listed = f"an index from 0 to {len(own) - 1}, one of {list(own)}, " if own else ""
     raise ValueError(
-        f"reset option 'instruction': got {short(given)}, expected an index from 0 to "
-        f"{len(sentences) - 1} or a sentence, for all envs or a list of {num_envs}; "
-        f"sentences: {list(sentences)}"
+        f"instruction: got {short(given)}{hint}, expected {listed}a sentence of the "
+        f"instruction language or an Instruction, for all envs or a list of {num_envs}"
     )
 
 
+def _instruction(given: Any, experiment: Experiment) -> Instruction:
+    """Return what is meant; SentenceError or LookupError: nothing."""
+    own = experiment.instructions if experiment.sentences else ()
+    if isinstance(given, Instruction):
+        return given
+    if given in experiment.sentences:
+        given = experiment.sentences.index(given)
+    if isinstance(given, str):
+        return Instruction(given, parse(given))
+    if _whole(given) and isinstance(own, tuple) and given in range(len(own)):
+        return own[given]
+    raise LookupError
+
+
 def options_of(
-    options: dict[str, Any], sentences: Sequence[str], num_envs: int
+    options: dict[str, Any], experiment: Experiment, num_envs: int
 ) -> list[dict[str, Any]]:
     """Return the reset options of each of N envs.
 
-    "instruction" is as for `instruction_indices`, "reconfigure" a bool for all envs;
+    "instruction" is as for `instructions_of`, "reconfigure" a bool for all envs;
     "reset_to_env_states" holds trees or arrays of N rows or of one.
 
     Raises:
@@ -66,7 +93,8 @@ def options_of(
     """
     require_names(options, RESET_OPTIONS)
     dealt = {
-        name: _deal(name, value, sentences, num_envs) for name, value in options.items()
+        name: _deal(name, value, experiment, num_envs)
+        for name, value in options.items()
     }
     return [{name: dealt[name][row] for name in dealt} for row in range(num_envs)]
 
@@ -99,11 +127,11 @@ def actions_of(actions: Any, shape: tuple[int, ...] | None) -> np.ndarray:
     return array
 
 
-def _deal(name: str, value: Any, sentences: Sequence[str], num_envs: int) -> list:
+def _deal(name: str, value: Any, experiment: Experiment, num_envs: int) -> list:
     """Return the value of an option for each of N envs."""
     what = f"reset option {name!r}"
     if name == "instruction" and value is not None:
-        return instruction_indices(value, sentences, num_envs)
+        return instructions_of(value, experiment, num_envs)
     if name == "reconfigure" and not isinstance(_plain(value), bool):
         raise ValueError(f"{what}: got {short(value)}, expected True or False")
     if name != "reset_to_env_states":

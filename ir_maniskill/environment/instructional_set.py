@@ -14,9 +14,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ir_maniskill.environment.senses import text_of, tokens_of
-from ir_maniskill.experiment import Experiment
-from ir_maniskill.goals import DIRECTIONS, Goal, GoalError, Measure, Ref
+from ir_maniskill.environment.senses import TEXT_BYTES, text_of, tokens_of
+from ir_maniskill.experiment import Experiment, Spoken
+from ir_maniskill.goals import (
+    DIRECTIONS,
+    Goal,
+    GoalError,
+    Instruction,
+    Measure,
+    Ref,
+    Touch,
+)
+from ir_maniskill.language.tokens import split_words
 from ir_maniskill.snapshot import Snapshot
 
 Deal = Callable[[Tensor, Tensor, Snapshot], Any]
@@ -25,30 +34,81 @@ Deal = Callable[[Tensor, Tensor, Snapshot], Any]
 
 
 class InstructionalSet:
-    """The instructions of one experiment as tensors, the shorter sentences padded.
+    """The instructions of an experiment, and those that envs were told beside them.
 
-    `tokens` are their ids [I, L] int64, `text` is UTF-8 [I, B] uint8; `hands` says
-    which fingers belong to each of the robot's hands [F] bool.
+    The I of the experiment come first; row I + n is what env n was told. `tokens` are
+    their ids [I + N, L] int64, `text` is UTF-8 [I + N, B] uint8, both padded; `hands`
+    says which fingers belong to each of the robot's hands [F] bool.
 
     Raises:
         GoalError: A goal asks for a hand that the robot does not have.
     """
 
     def __init__(
-        self, experiment: Experiment, hands: Mapping[str, Tensor], device: torch.device
+        self,
+        experiment: Experiment,
+        hands: Mapping[str, Tensor],
+        device: torch.device,
+        num_envs: int = 1,
     ) -> None:
-        sentences = experiment.sentences
-        self.tokens = tokens_of(sentences, experiment.vocabulary).to(device)
-        self.text = text_of(sentences).to(device)
-        goals = [instruction.goal for instruction in experiment.instructions]
-        self.goals = GoalTable(goals, hands, device)
+        fixed = experiment.instructions
+        own = () if isinstance(fixed, Spoken) else fixed
+        self.instructions: list[Instruction] = [*own, *[UNTOLD] * num_envs]
+        self._hands, self._device = hands, device
+        self._vocabulary, self._size = experiment.vocabulary, len(own)
+        texts, length = [i.text for i in self.instructions], experiment.max_tokens
+        self.tokens = self._tokens(texts, length).to(device)
+        self.text = text_of(texts, TEXT_BYTES).to(device)
+        self._build()
 
     def __len__(self) -> int:
-        return len(self.tokens)
+        """Return the number of the experiment's own: I."""
+        return self._size
 
     def pick(self, uniform: Tensor) -> Tensor:
-        """Map uniform numbers in [0, 1) to instruction indices [N] int64."""
+        """Map uniform numbers in [0, 1) to the experiment's own [N] int64."""
         return (uniform * len(self)).long().clamp(max=len(self) - 1)
+
+    def tell(self, said: Mapping[int, Instruction]) -> dict[int, int]:
+        """Write down what envs were told; return the row of each.
+
+        Raises:
+            GoalError: A sentence is too long for the observation, or asks for a hand
+                that the robot does not have; then nothing was written.
+        """
+        length = self.tokens.shape[1]
+        texts = [instruction.text for instruction in said.values()]
+        tokens, text = self._tokens(texts, length), text_of(texts, TEXT_BYTES)
+        before = list(self.instructions)
+        rows = {env: self._size + env for env in said}
+        for env, row in rows.items():
+            self.instructions[row] = said[env]
+        try:
+            self._build()
+        except GoalError:
+            self.instructions = before
+            raise
+        at = torch.tensor(list(rows.values()), device=self._device)
+        self.tokens[at] = tokens.to(self._device)
+        self.text[at] = text.to(self._device)
+        return rows
+
+    def _build(self) -> None:
+        goals = [instruction.goal for instruction in self.instructions]
+        self.goals = GoalTable(goals, self._hands, self._device)
+
+    def _tokens(self, texts: Sequence[str], length: int) -> Tensor:
+        for text in texts:
+            if len(split_words(text)) > length:
+                raise GoalError(
+                    f"instruction text: got {text!r}, expected at most {length} words "
+                    "and full stops in this task"
+                )
+        return tokens_of(texts, self._vocabulary, length)
+
+
+UNTOLD = Instruction("", Touch(Ref()))
+"""What an env was told that was told nothing."""
 
 
 @dataclass(frozen=True)

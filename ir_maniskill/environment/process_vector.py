@@ -152,7 +152,7 @@ class ProcessVectorEnv(VectorEnv):
             seed = FIRST_SEED
         count = self.num_envs
         seeds = [None] * count if seed is None else seeds_of(seed, count)
-        dealt = options_of(options, self.experiment.sentences, count)
+        dealt = options_of(options, self.experiment, count)
         each = list(zip(seeds, dealt, strict=True))
         self._command("reset", [[each[row] for row in rows] for rows in self._rows])
         self._seeded = True

@@ -18,8 +18,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from ir_maniskill.environment.bodies import positions
-from ir_maniskill.experiment import PAD, tokenize
+from ir_maniskill.goals import GoalError
+from ir_maniskill.language.tokens import PAD, tokenize
 
 Observation = dict[str, Any]
 """o_t of N envs in an image or state_dict mode, nested as ManiSkill does."""
@@ -122,7 +122,7 @@ _TERMS = [
     Term("instruction", "language", "L", _of_sentence("tokens")),
     Term("text", "language", "B", _of_sentence("text"), asked=True),
     _privileged("velocity", "J", lambda env, _: env.agent.joint_velocity(), "agent"),
-    _privileged("object_position", "C, 3", lambda env, _: positions(env.objects)),
+    _privileged("object_position", "C, 3", lambda env, _: env.table.poses()[..., :3]),
     _privileged("finger_position", "F, 3", lambda env, _: env.agent.finger_position()),
     _privileged("target_object", "C", lambda env, _: env.measure.serves.any(1).float()),
     _privileged("target_finger", "F", lambda env, _: env.measure.serves.any(2).float()),
@@ -206,17 +206,31 @@ def entries(senses: Iterable[str]) -> dict[str, Encoder]:
 # -- Sentences as tensors --------------------------------------------------------------
 
 
-def tokens_of(sentences: Sequence[str], vocabulary: tuple[str, ...]) -> Tensor:
-    """Return the token ids of sentences, padded to the longest [I, L] int64."""
-    return _padded([tokenize(s, vocabulary) for s in sentences], torch.int64)
+TEXT_BYTES = 256
+"""Most bytes of a sentence."""
 
 
-def text_of(sentences: Sequence[str]) -> Tensor:
-    """Return the UTF-8 bytes of sentences, padded with 0 to the longest [I, B] uint8.
+def tokens_of(
+    sentences: Sequence[str], vocabulary: tuple[str, ...], length: int
+) -> Tensor:
+    """Return the token ids of sentences, padded to a length [I, L] int64."""
+    return _padded([tokenize(s, vocabulary) for s in sentences], length, torch.int64)
+
+
+def text_of(sentences: Sequence[str], length: int = TEXT_BYTES) -> Tensor:
+    """Return the UTF-8 bytes of sentences, padded with 0 to a length [I, B] uint8.
 
     So text goes wherever tensors do: between processes, into replays and recordings.
+
+    Raises:
+        GoalError: A sentence has more bytes.
     """
-    return _padded([list(s.encode()) for s in sentences], torch.uint8)
+    rows = [list(sentence.encode()) for sentence in sentences]
+    for sentence, row in zip(sentences, rows, strict=True):
+        if len(row) > length:
+            got = f"{sentence[:40]!r}... of {len(row)} bytes"
+            raise GoalError(f"instruction text: got {got}, expected at most {length}")
+    return _padded(rows, length, torch.uint8)
 
 
 def read_text(rows: Tensor) -> list[str]:
@@ -224,8 +238,7 @@ def read_text(rows: Tensor) -> list[str]:
     return [bytes(row).rstrip(b"\0").decode() for row in rows.tolist()]
 
 
-def _padded(rows: list[list[int]], dtype: torch.dtype) -> Tensor:
-    length = max(map(len, rows))
+def _padded(rows: list[list[int]], length: int, dtype: torch.dtype) -> Tensor:
     return torch.tensor([r + [PAD] * (length - len(r)) for r in rows], dtype=dtype)
 
 

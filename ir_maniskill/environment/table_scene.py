@@ -19,6 +19,7 @@ from mani_skill.render.shaders import (
     default_position_texture_transform,
 )
 from mani_skill.sensors.camera import CameraConfig
+from mani_skill.utils.building import ActorBuilder
 from mani_skill.utils.sapien_utils import look_at
 from mani_skill.utils.structs import Actor, Pose
 from torch import Tensor
@@ -26,18 +27,26 @@ from torch import Tensor
 from ir_maniskill.assets.nao import SOLE_HEIGHT
 from ir_maniskill.environment.robots.robot import Robot
 from ir_maniskill.experiment import OBJECT_SIZE, TABLE, TouchObject
-from ir_maniskill.goals import COLORS
+from ir_maniskill.goals import COLORS, FIXED
 
 TABLE_TOP = 0.03
 """Height of the table top [m]."""
 TABLE_THICKNESS = 0.02
 """Thickness of the table top [m]."""
-OBJECT_HEIGHT = {"cube": OBJECT_SIZE, "button": 0.024}
+OBJECT_HEIGHT = {"cube": OBJECT_SIZE, "button": 0.024, "can": 0.055, "pyramid": 0.05}
 """Height of each shape [m]."""
-CUBE_MASS = 0.05
-"""[kg]"""
+DENSITY = 0.05 / OBJECT_SIZE**3
+"""Of what is free: a cube has 50 g at NAO's scale [kg/m^3]."""
+TOP_COLOR = {"can": (0.45, 0.45, 0.47), "pyramid": (0.85, 0.85, 0.85)}
+"""Linear RGB of the tops of shapes that are told by them, seen from above."""
+SHELF = (-3.0, 0.0, -1.0)
+"""Middle of what carries objects that are not on the table; no camera sees it [m]."""
+SHELF_STEP = 0.2
+"""Distance between objects on the shelf [m]."""
 STAND_COLOR = (0.18, 0.19, 0.21)
 """Linear RGB of the pillar of a robot that has no feet."""
+
+_MESHES = files("ir_maniskill.assets") / "scene"
 
 
 def _rgb(data: Tensor) -> dict[str, Tensor]:
@@ -81,8 +90,7 @@ def build_room(scene: ManiSkillScene, robot: Robot) -> Actor:
     half = np.array([(x1 - x0) / 2, (y1 - y0) / 2, TABLE_THICKNESS / 2])
     center = np.array([(x0 + x1) / 2, (y0 + y1) / 2, TABLE_TOP - TABLE_THICKNESS / 2])
     builder.add_box_collision(sapien.Pose(scale * center), half_size=scale * half)
-    mesh = files("ir_maniskill.assets") / "scene" / "room.glb"
-    builder.add_visual_from_file(str(mesh), scale=[scale] * 3)
+    builder.add_visual_from_file(str(_MESHES / "room.glb"), scale=[scale] * 3)
     if robot.stand and scene.can_render():
         x, y, top = robot.mount.p
         ground = scale * SOLE_HEIGHT
@@ -93,26 +101,53 @@ def build_room(scene: ManiSkillScene, robot: Robot) -> Actor:
     return builder.build_static(name="room")
 
 
-def build_object(scene: ManiSkillScene, thing: TouchObject, scale: float) -> Actor:
-    """Build one object: a free cube, or a button that stays where it is put."""
+def build_object(
+    scene: ManiSkillScene, thing: TouchObject, place: np.ndarray, scale: float
+) -> Actor:
+    """Build one object at a place [3] [m]: a free one, or one that stays where put."""
     builder = scene.create_actor_builder()
+    builder.initial_pose = sapien.Pose(place)
     size, height = scale * OBJECT_SIZE, scale * OBJECT_HEIGHT[thing.shape]
-    x, y = thing.position
-    z = TABLE_TOP + OBJECT_HEIGHT[thing.shape] / 2
-    builder.initial_pose = sapien.Pose([scale * x, scale * y, scale * z])
     if thing.shape == "cube":
-        half = [size / 2] * 3
-        builder.add_box_collision(half_size=half, density=CUBE_MASS / OBJECT_SIZE**3)
-        if scene.can_render():
-            builder.add_box_visual(half_size=half, material=_paint(COLORS[thing.color]))
-        return builder.build(name=thing.name)
-    upright = sapien.Pose(q=[math.sqrt(0.5), 0, -math.sqrt(0.5), 0])
-    builder.add_cylinder_collision(upright, size / 2, height / 2)
+        builder.add_box_collision(half_size=[size / 2] * 3, density=DENSITY)
+    elif thing.shape == "pyramid":
+        hull = str(_MESHES / "pyramid_hull.glb")
+        builder.add_convex_collision_from_file(hull, scale=[scale] * 3, density=DENSITY)
+    else:
+        upright = sapien.Pose(q=[math.sqrt(0.5), 0, -math.sqrt(0.5), 0])
+        builder.add_cylinder_collision(upright, size / 2, height / 2, density=DENSITY)
     if scene.can_render():
-        mesh = files("ir_maniskill.assets") / "scene" / "button.glb"
-        material = _paint(COLORS[thing.color])
-        builder.add_visual_from_file(str(mesh), scale=[scale] * 3, material=material)
-    return builder.build_kinematic(name=thing.name)
+        _paint_object(builder, thing, scale)
+    if thing.shape in FIXED:
+        return builder.build_kinematic(name=thing.name)
+    return builder.build(name=thing.name)
+
+
+def _paint_object(builder: ActorBuilder, thing: TouchObject, scale: float) -> None:
+    paint = _paint(COLORS[thing.color])
+    if thing.shape == "cube":
+        half = [scale * OBJECT_SIZE / 2] * 3
+        builder.add_box_visual(half_size=half, material=paint)
+        return
+    parts = {thing.shape: paint}
+    if thing.shape in TOP_COLOR:
+        parts[f"{thing.shape}_top"] = _paint(TOP_COLOR[thing.shape])
+    for name, material in parts.items():
+        mesh = str(_MESHES / f"{name}.glb")
+        builder.add_visual_from_file(mesh, scale=[scale] * 3, material=material)
+
+
+def build_shelf(scene: ManiSkillScene, count: int, scale: float) -> np.ndarray:
+    """Build a shelf out of sight; return places for objects [count, 3] [m]."""
+    row = math.ceil(math.sqrt(count))
+    half = np.array([row * SHELF_STEP, row * SHELF_STEP, 0.02])
+    builder = scene.create_actor_builder()
+    builder.add_box_collision(half_size=scale * half)
+    builder.initial_pose = sapien.Pose(scale * np.array(SHELF))
+    builder.build_static(name="shelf")
+    steps = np.stack(np.divmod(np.arange(count), row), axis=1) - row / 2
+    above = np.full((count, 1), 0.02)  # of the shelf's middle
+    return scale * (np.array(SHELF) + np.hstack([SHELF_STEP * steps, above]))
 
 
 def _paint(color: tuple[float, float, float]) -> sapien.render.RenderMaterial:

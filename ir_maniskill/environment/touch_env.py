@@ -15,22 +15,23 @@ import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import common
-from mani_skill.utils.structs import Pose
 from mani_skill.utils.structs.types import SceneConfig, SimConfig
 from torch import Tensor
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.doctor import require_vulkan
 from ir_maniskill.environment import reward_generator, senses, table_scene
-from ir_maniskill.environment.arguments import instruction_indices
-from ir_maniskill.environment.bodies import poses, velocities
+from ir_maniskill.environment.arguments import instructions_of
 from ir_maniskill.environment.instructional_set import GoalBatch, InstructionalSet
+from ir_maniskill.environment.layout import layout_of
 from ir_maniskill.environment.rendering import RenderedEnv
 from ir_maniskill.environment.reward_generator import RewardWeights
 from ir_maniskill.environment.robots import Nao
 from ir_maniskill.environment.robots.robot import Robot, available_robots, find_robot
-from ir_maniskill.experiment import Experiment, ExperimentError
-from ir_maniskill.goals import COLORS, SHAPES
+from ir_maniskill.environment.speaker import Speaker
+from ir_maniskill.environment.table_objects import TableObjects
+from ir_maniskill.experiment import Experiment, ExperimentError, Spoken
+from ir_maniskill.goals import GoalError, Instruction
 from ir_maniskill.snapshot import Snapshot
 
 CONTROL_FREQ = 20
@@ -48,6 +49,8 @@ class TouchEnv(RenderedEnv):
     - the sentence, drawn from the experiment's Instructional Set
     - the objects' places and yaws and the joints' start, by `Experiment.jitter`
     - which object lies where, if `Experiment.shuffled`
+    - which objects lie anywhere in reach, and sentences true of them, if they are
+      `Drawn` and `Spoken`
 
     **Success Conditions:**
     - the goal holds, e.g. a finger touches the named object. This does not end the
@@ -67,6 +70,7 @@ class TouchEnv(RenderedEnv):
         render_backend: str | None = "auto",
         reward_weights: dict[str, float] | None = None,
         observe: Sequence[str] = (),
+        split: str = "train",
         **kwargs: Any,
     ) -> None:
         """Build the env.
@@ -79,6 +83,8 @@ class TouchEnv(RenderedEnv):
                 one and else whatever Vulkan finds, software included.
             reward_weights: Changes of `RewardWeights`, for the dense reward modes.
             observe: What to observe beside the usual: "text" is the sentence's bytes.
+            split: Of a task with `Spoken` instructions: "train", or what is held out
+                of it, "wording", "objects", "pairs" or "places".
             *args: As for `BaseEnv`.
             **kwargs: As for `BaseEnv`.
 
@@ -98,7 +104,7 @@ class TouchEnv(RenderedEnv):
                 f"experiment: got {experiment!r}, expected an Experiment or its id, "
                 f"available: {', '.join(catalog.available())}"
             )
-        self.experiment = experiment
+        self.experiment = experiment.in_split(split)
         _require_one_on_cpu(kwargs)
         robot_uids = find_robot(robot_uids)
         # ManiSkill warns of robots that are not in here; ours are not the only ones.
@@ -136,68 +142,69 @@ class TouchEnv(RenderedEnv):
     def _load_scene(self, options: dict) -> None:
         self.agent.require_reach(self.experiment)
         table_scene.build_room(self.scene, self.agent)
-        self.objects = [
-            table_scene.build_object(self.scene, thing, self.agent.scale)
-            for thing in self.experiment.objects
-        ]
+        self.table = TableObjects(self.scene, self.experiment, self.agent.scale)
+        self.objects = self.table.bodies
 
     def _load_lighting(self, options: dict) -> None:
         scale = self.agent.scale
         table_scene.add_lights(self.scene, scale, shadow=self.enable_shadow)
 
     def _after_reconfigure(self, options: dict) -> None:
-        things, count, device = self.experiment.objects, self.num_envs, self.device
+        task, count, device = self.experiment, self.num_envs, self.device
         hands = {
             name: torch.tensor(fingers, device=device)
             for name, fingers in _hands(self.agent).items()
         }
-        self.instructional_set = InstructionalSet(self.experiment, hands, device)
+        self.instructional_set = InstructionalSet(task, hands, device, count)
+        self._layout = layout_of(task, self.agent)
+        spoken = isinstance(task.instructions, Spoken)
+        self._speaker = Speaker(task, self._layout) if spoken else None
         self._touch = self.agent.touch_sensor(self.objects)
         self._weights = self._reward_weights.vector().to(device)
-        heights = [table_scene.OBJECT_HEIGHT[thing.shape] for thing in things]
-        self._places = np.array([thing.position for thing in things])  # [C, 2], NAO's
-        self._object_z = table_scene.TABLE_TOP + np.array(heights) / 2  # [C], NAO's
-        kinds = [(list(COLORS).index(o.color), SHAPES.index(o.shape)) for o in things]
-        color_and_shape = torch.tensor(kinds, device=device).T
-        self._color, self._shape = color_and_shape[:, None].repeat(1, count, 1)
         self.instruction_index = torch.zeros(count, dtype=torch.int64, device=device)
         self._stage = torch.zeros_like(self.instruction_index)
         self._success_once = torch.zeros(count, dtype=torch.bool, device=device)
         self._wrong_once = torch.zeros_like(self._success_once)
-        self._start = torch.zeros(count, len(things), 7, device=device)
+        self._start = torch.zeros(count, task.slots, 7, device=device)
         # What a pose is divided by to be one at NAO's scale.
         self._size = torch.tensor([self.agent.scale] * 3 + [1.0] * 4, device=device)
 
     # -- Episode ---------------------------------------------------------------------
 
     def _initialize_episode(self, env_idx: Tensor, options: dict) -> None:
-        count, joints = len(self.objects), len(self.agent.start_qpos)
-        noise = self._batched_episode_rng[env_idx].uniform(size=1 + 4 * count + joints)
-        pick, order, place, yaw, joint = np.split(
-            noise, np.cumsum([1, count, 2 * count, count]), axis=1
-        )
-        self._choose_instruction(env_idx, pick[:, 0], options.get("instruction"))
-        self._place_objects(env_idx, order, 2 * place - 1, 2 * yaw - 1)
+        slots, joints = self.experiment.slots, len(self.agent.start_qpos)
+        sizes = [1, self._layout.noise, slots, joints]
+        noise = self._batched_episode_rng[env_idx].uniform(size=sum(sizes))
+        pick, layout, yaw, joint = np.split(noise, np.cumsum(sizes)[:-1], axis=1)
+        told = options.get("instruction")
+        if told is not None:
+            told = instructions_of(told, self.experiment, len(env_idx))
+        if self._speaker is None:
+            slot, xy = self._layout.lay_out(layout)
+            index = self.instructional_set.pick(self._tensor(pick[:, 0]))
+        else:
+            streams = [self._batched_episode_rng[env] for env in env_idx.tolist()]
+            slot, xy, told = self._speaker.draw(streams, told)
+        if told is not None:
+            index = self._tell(env_idx, told)
+        self.instruction_index = self.instruction_index.index_put((env_idx,), index)
+        self._place_objects(env_idx, slot, xy, 2 * yaw - 1)
         jitter = self._tensor(2 * joint - 1) * self.experiment.jitter.joints
         jitter = jitter * self.agent.jitter_unit
         qpos = self.agent.clamp_qpos(self.agent.start_qpos + jitter)
         self.agent.robot.set_qpos(qpos)
+        self._touch.clear(env_idx)
+        self._drawing = False
+        self._begin(env_idx)
+
+    def _begin(self, env_idx: Tensor) -> None:
+        """Forget what was reached and fouled, and look up what sentences refer to."""
         # The last step's info, which others may keep, holds these very tensors.
         self._success_once = self._success_once.index_fill(0, env_idx, False)
         self._wrong_once = self._wrong_once.index_fill(0, env_idx, False)
         self._stage = self._stage.index_fill(0, env_idx, 0)
-        self._drawing = self._stepped = False
-        self._touch.clear(env_idx)
+        self._stepped = False
         self._resolve_goals()
-
-    def _choose_instruction(
-        self, env_idx: Tensor, uniform: np.ndarray, forced: Any
-    ) -> None:
-        index = self.instructional_set.pick(self._tensor(uniform))
-        if forced is not None:
-            told = instruction_indices(forced, self.experiment.sentences, len(env_idx))
-            index = torch.tensor(told, device=self.device)
-        self.instruction_index[env_idx] = index
 
     def _resolve_goals(self) -> None:
         """Look up what the sentences of all envs refer to, as their episodes began."""
@@ -205,22 +212,66 @@ class TouchEnv(RenderedEnv):
         self._goals: GoalBatch = table.deal(self.instruction_index, self.snapshot())
 
     def _place_objects(
-        self, env_idx: Tensor, order: np.ndarray, place: np.ndarray, yaw: np.ndarray
+        self, env_idx: Tensor, slot: np.ndarray, xy: np.ndarray, turn: np.ndarray
     ) -> None:
-        """Lay the objects out; all arguments are uniform noise with b rows."""
-        batch, count = order.shape
-        seat = np.argsort(order) if self.experiment.shuffled else np.arange(count)
-        jitter = self.experiment.jitter
-        xy = np.broadcast_to(self._places[seat], (batch, count, 2))
-        xy = xy + jitter.position * place.reshape(batch, count, 2)
-        z = np.broadcast_to(self._object_z, (batch, count))
-        place = np.concatenate([xy, z[..., None]], axis=-1)
-        position = self._tensor(self.agent.scale * place)  # [b, C, 3] [m]
-        rotation = self._tensor(table_scene.yaw_quaternion(jitter.yaw * yaw))
-        self._start = self._start.clone()
-        self._start[env_idx] = torch.cat([position, rotation], dim=-1)
-        for index, thing in enumerate(self.objects):
-            thing.set_pose(Pose.create_from_pq(position[:, index], rotation[:, index]))
+        """Lay the objects out; turns are from -1 to 1 [b, C]."""
+        yaw = table_scene.yaw_quaternion(self.experiment.jitter.yaw * turn)
+        at = torch.tensor(slot, device=self.device)
+        place, rotation = self._tensor(self.agent.scale * xy), self._tensor(yaw)
+        pose = self.table.lay_out(env_idx, at, place, rotation)
+        self._start = self._start.index_put((env_idx,), pose)
+
+    # -- Sentences -------------------------------------------------------------------
+
+    @property
+    def instructions(self) -> list[Instruction]:
+        """The active sentence i_t and the goal of each env [N]."""
+        known = self.instructional_set.instructions
+        return [known[index] for index in self.instruction_index.tolist()]
+
+    def get_language_instruction(self) -> list[str]:
+        """Return the active sentence i_t of each env (N strings)."""
+        return [instruction.text for instruction in self.instructions]
+
+    def tell(self, said: Any, env_idx: Tensor | None = None) -> None:
+        """Give other instructions without a reset.
+
+        What they ask for counts from here on: pushes from where things are now, and
+        what was reached or fouled before is forgotten.
+
+        Args:
+            said: A sentence, an `Instruction` or an index of the task's own, for all of
+                these envs or a list of one for each.
+            env_idx: Which envs; None: all.
+
+        Raises:
+            ValueError: A sentence means nothing that the task or the language knows.
+            GoalError: It does not fit the scene, or is too long; nothing has changed.
+        """
+        if env_idx is None:
+            env_idx = torch.arange(self.num_envs, device=self.device)
+        told = instructions_of(said, self.experiment, len(env_idx))
+        kept = self.get_state_dict()["task"]
+        start = self._start.clone()
+        start[env_idx] = self.table.poses()[env_idx]
+        try:
+            index = self._tell(env_idx, told)
+            self.instruction_index = self.instruction_index.index_put((env_idx,), index)
+            self._start = start
+            self._begin(env_idx)
+        except GoalError:
+            self._set_task_state(kept, slice(None))
+            raise
+
+    def _tell(self, env_idx: Tensor, said: Sequence[Instruction]) -> Tensor:
+        """Return where the Instructional Set has what envs are told [b] int64."""
+        own, count = self.instructional_set.instructions, len(self.instructional_set)
+        found = {instruction: row for row, instruction in enumerate(own[:count])}
+        envs = env_idx.tolist()
+        new = {e: i for e, i in zip(envs, said, strict=True) if i not in found}
+        rows = self.instructional_set.tell(new) if new else {}
+        index = [rows[e] if e in rows else found[said[k]] for k, e in enumerate(envs)]
+        return torch.tensor(index, device=self.device)
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.as_tensor(array, dtype=torch.float32, device=self.device)
@@ -282,11 +333,6 @@ class TouchEnv(RenderedEnv):
 
     # -- Measures --------------------------------------------------------------------
 
-    def get_language_instruction(self) -> list[str]:
-        """Return the active sentence i_t of each env (N strings)."""
-        sentences = self.experiment.sentences
-        return [sentences[index] for index in self.instruction_index.tolist()]
-
     def snapshot(self) -> Snapshot:
         """Return what goals are measured on, as of now.
 
@@ -294,13 +340,13 @@ class TouchEnv(RenderedEnv):
         there are none until the next step.
         """
         return Snapshot(
-            contact=self._touch.read(),
+            contact=self.table.contact(self._touch.read()),
             fingertip=self.agent.finger_position() / self.agent.scale,
-            pose=poses(self.objects) / self._size,
+            pose=self.table.poses() / self._size,
             start=self._start / self._size,
-            velocity=velocities(self.objects) / self.agent.scale,
-            color=self._color,
-            shape=self._shape,
+            velocity=self.table.velocities() / self.agent.scale,
+            color=self.table.color,
+            shape=self.table.shape,
             stage=self._stage,
         )
 
@@ -381,6 +427,8 @@ class TouchEnv(RenderedEnv):
         """Return what of the task is state beside bodies and joint targets [N, ...]."""
         return {
             "instruction_index": self.instruction_index.float()[:, None],
+            "told": self.instructional_set.text[-self.num_envs :].float(),
+            "slot": self.table.slot.float(),
             "stage": self._stage.float()[:, None],
             "success_once": self._success_once.float()[:, None],
             "wrong_once": self._wrong_once.float()[:, None],
@@ -412,12 +460,21 @@ class TouchEnv(RenderedEnv):
         task = self._task_state()
         for name, value in given.items():
             task[name][rows] = value.to(task[name])
+        self._restore_told(task["told"].byte())
         self.instruction_index = task["instruction_index"][:, 0].long()
+        self.table.put(slice(None), task["slot"].long())
         self._stage = task["stage"][:, 0].long()
         self._success_once = task["success_once"][:, 0].bool()
         self._wrong_once = task["wrong_once"][:, 0].bool()
         self._start = task["start"].view_as(self._start)
         self._resolve_goals()
+
+    def _restore_told(self, text: Tensor) -> None:
+        """Tell envs the sentences [N, B] that they had been told."""
+        if not torch.equal(text, self.instructional_set.text[-self.num_envs :]):
+            said = {e: s for e, s in enumerate(senses.read_text(text)) if s}
+            told = instructions_of(list(said.values()), self.experiment, len(said))
+            self.instructional_set.tell(dict(zip(said, told, strict=True)))
 
     def set_state(self, state: Tensor, env_idx: Tensor | None = None) -> None:
         """Restore what `get_state` returned: the same, as one flat row per env."""

@@ -3,7 +3,7 @@
 `grammar.json` has the phrasings, `wording.json` sentences written by hand.
 """
 
-from ir_maniskill.language.draw import Thing, draw, things
+from ir_maniskill.language.draw import Allows, Thing, draw, things
 from ir_maniskill.language.grammar import SentenceError, count, parse, say
 from ir_maniskill.language.splits import (
     HELD_OBJECTS,
@@ -12,6 +12,7 @@ from ir_maniskill.language.splits import (
     SPLITS,
     counts,
     handwritten,
+    kind_of,
     split_of,
     words,
 )
@@ -21,12 +22,14 @@ __all__ = [
     "HELD_PAIRS",
     "KINDS",
     "SPLITS",
+    "Allows",
     "SentenceError",
     "Thing",
     "count",
     "counts",
     "draw",
     "handwritten",
+    "kind_of",
     "parse",
     "say",
     "split_of",

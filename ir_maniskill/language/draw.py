@@ -46,6 +46,10 @@ Found = tuple[Name, Where, int]
 Act = tuple[str, Name, Where, int]
 """A verb and its object."""
 
+Allows = Callable[[Sequence[tuple[str, int]]], bool]
+"""Whether verbs can be done to objects together, by their places in the scene; the verb
+"name" only names one."""
+
 MARGIN = 0.02
 """By how much a relation must be true to be said [m]."""
 
@@ -88,8 +92,9 @@ def things(scene: Snapshot) -> list[tuple[Thing, ...]]:
 class _Scene:
     """What can be said of the objects of a scene."""
 
-    def __init__(self, scene: Sequence[Thing], split: str) -> None:
+    def __init__(self, scene: Sequence[Thing], split: str, allows: Allows) -> None:
         self.things = scene
+        self.allows = allows
         self.split = split if split in ("objects", "pairs") else "train"
         self.groups: dict[Name, int] = {}  # whom each description fits
         for index, (color, shape, _, _) in enumerate(scene):
@@ -103,7 +108,7 @@ class _Scene:
         self.known = [  # what training may name beside what it acts on
             (name, index)
             for name, _, index in self.plain
-            if scene[index][:2] not in HELD_OBJECTS
+            if scene[index][:2] not in HELD_OBJECTS and allows([("name", index)])
         ]
 
     def acts(
@@ -118,6 +123,7 @@ class _Scene:
             # In other splits, the sentence must name what is new.
             if status(verb, color, shape) == split == status(verb, *name)
             and can(verb, (color, shape))
+            and self.allows([(verb, index)])
         ]
 
     def related(self, relation: str) -> list[Found]:
@@ -164,6 +170,7 @@ def draw(
     kinds: Collection[str],
     rng: Random,
     split: str = "train",
+    allows: Allows = lambda acts: True,
 ) -> Goal:
     """Return a goal that is true of a scene: each `Ref` fits exactly one object.
 
@@ -172,6 +179,7 @@ def draw(
         kinds: Of `KINDS`; those that the scene allows are equally likely.
         rng: Draws it.
         split: One of `SPLITS`.
+        allows: What the robot can do in this scene.
 
     Raises:
         GoalError: The scene allows none, or there is no such kind or split.
@@ -181,7 +189,7 @@ def draw(
             raise GoalError(
                 f"{what}: got {unknown[0]!r}, available: {', '.join(known)}"
             )
-    view = _Scene(scene, split)
+    view = _Scene(scene, split, allows)
     for kind in _shuffled(kinds, rng):
         goal = _DRAW[kind](view, rng)
         if goal is not None:
@@ -240,7 +248,12 @@ def _two(
             view.acts(pair[i], view.plain, view.split if i == new else "train")
             for i in (0, 1)
         )
-        both = [(x, y) for x, y in product(a, b) if x[3] != y[3]]
+        both = [
+            (x, y)
+            for x, y in product(a, b)
+            if x[3] != y[3]
+            and (kind is Then or view.allows([(x[0], x[3]), (y[0], y[3])]))
+        ]
         if both:
             return kind(*map(_goal, _pick(both, rng)))
     return None

@@ -17,7 +17,6 @@ from itertools import chain
 from random import Random
 from typing import Any
 
-from ir_maniskill.experiment import split_words, words_of
 from ir_maniskill.goals import (
     COLORS,
     EXTREMES,
@@ -32,6 +31,7 @@ from ir_maniskill.goals import (
     Then,
     Touch,
 )
+from ir_maniskill.language.tokens import split_words, words_of
 
 Slots = dict[str, Any]
 """The meaning of each slot of a phrase."""

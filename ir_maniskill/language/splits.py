@@ -9,15 +9,16 @@ from collections.abc import Collection, Iterator
 from functools import cache
 from itertools import product
 
-from ir_maniskill.experiment import Instruction, words_of
 from ir_maniskill.goals import (
     COLORS,
     EXTREMES,
+    FIXED,
     RELATIONS,
     SHAPES,
     Avoid,
     Both,
     Goal,
+    Instruction,
     Push,
     Ref,
     Relation,
@@ -25,6 +26,7 @@ from ir_maniskill.goals import (
     Touch,
 )
 from ir_maniskill.language.grammar import count, load_json, parse, words_by_mark
+from ir_maniskill.language.tokens import words_of
 
 Name = tuple[str | None, str | None]
 
@@ -41,9 +43,6 @@ VERBS = {
 }
 TEAMS = (("touch", "touch"), ("left hand", "right hand"), ("right hand", "left hand"))
 """Verbs that can be done at the same time."""
-
-FIXED = ("button",)
-"""Shapes that cannot be pushed."""
 
 _HELD = load_json("grammar.json")["held_out"]
 HELD_OBJECTS = frozenset((color, shape) for color, shape in _HELD["objects"])
@@ -82,7 +81,8 @@ def split_of(goal: Goal) -> str | None:
     None: none of them, as more than one thing is new in it. This reads the goal alone;
     `draw` also minds what a "red one" is in its scene.
     """
-    acts, named = _acts(goal), {(r.color, r.shape) for r in _refs(goal)}
+    acts = [(verb, (ref.color, ref.shape)) for verb, ref in acts_of(goal)]
+    named = {(r.color, r.shape) for r in _refs(goal)}
     new = {status(verb, *name) for verb, name in acts} - {"train"}
     beside = named - {name for _, name in acts}
     if beside & HELD_OBJECTS or len(new) > 1:
@@ -90,14 +90,31 @@ def split_of(goal: Goal) -> str | None:
     return new.pop() if new else "train"
 
 
-def _acts(goal: Goal) -> list[tuple[str, Name]]:
+def kind_of(goal: Goal) -> str:
+    """Return which of `KINDS` a goal of the language is."""
+    match goal:
+        case Then():
+            return "then"
+        case Both(_, Avoid()):
+            return "where"
+    if any(ref.where is not None for ref in goal.refs):
+        return "where"
+    match goal:
+        case Push():
+            return "push"
+        case Touch(_, hand):
+            return "hand" if hand else "touch"
+    return "both"
+
+
+def acts_of(goal: Goal) -> list[tuple[str, Ref]]:
     """Return the verbs in a goal, each with the object that it is done to."""
     match goal:
         case Touch(ref, hand):
-            return [(f"{hand} hand" if hand else "touch", (ref.color, ref.shape))]
+            return [(f"{hand} hand" if hand else "touch", ref)]
         case Push(ref, direction):
-            return [(f"push {direction}", (ref.color, ref.shape))]
-    return [found for part in goal.parts for found in _acts(part)]
+            return [(f"push {direction}", ref)]
+    return [found for part in goal.parts for found in acts_of(part)]
 
 
 def _refs(goal: Goal) -> list[Ref]:

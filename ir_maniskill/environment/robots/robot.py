@@ -27,7 +27,7 @@ from ir_maniskill.environment.bodies import positions
 from ir_maniskill.environment.robots.controller import TargetControllerConfig
 from ir_maniskill.environment.robots.loader import read_builder
 from ir_maniskill.environment.robots.urdf import RobotError, read_motors
-from ir_maniskill.experiment import Experiment, ExperimentError
+from ir_maniskill.experiment import Drawn, Experiment, ExperimentError
 
 
 @dataclass(frozen=True)
@@ -108,6 +108,8 @@ class Robot(BaseAgent, ABC):
             ExperimentError: An object may lie too far from every shoulder.
         """
         slack = experiment.jitter.position * math.sqrt(2)
+        if isinstance(experiment.objects, Drawn):
+            return  # what is drawn is drawn within reach
         for thing in experiment.objects:
             place = [cls.scale * value for value in thing.position]
             far = min(math.dist(place, shoulder) for shoulder in cls.shoulders)

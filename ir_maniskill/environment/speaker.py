@@ -1,0 +1,133 @@
+"""Speaker: draws scenes with something to say of each, and says it (Sec. III-A).
+
+Legend: b scenes, C slots.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from random import Random
+
+import numpy as np
+
+from ir_maniskill.environment.layout import Free, Seats
+from ir_maniskill.experiment import Experiment, Spoken, TouchObject, scene_of
+from ir_maniskill.goals import Goal, GoalError, Instruction, Ref
+from ir_maniskill.language import Thing, draw, handwritten, kind_of, say
+from ir_maniskill.language.splits import acts_of, status
+from ir_maniskill.language.tokens import split_words
+
+SCENES = 5000
+"""How many scenes are drawn at most to find one that a sentence is true of."""
+
+BY_HAND = 0.5
+"""Share of the sentences of the split `wording` that were written by hand."""
+
+
+class Speaker:
+    """What is said in the scenes of an experiment with `Spoken` instructions."""
+
+    def __init__(self, experiment: Experiment, layout: Seats | Free) -> None:
+        assert isinstance(experiment.instructions, Spoken)
+        self.spoken = experiment.instructions
+        self.bodies = experiment.bodies
+        self.layout = layout
+        self.by_hand = [
+            i for i in handwritten() if kind_of(i.goal) in self.spoken.kinds
+        ]
+
+    def draw(
+        self,
+        streams: Sequence[np.random.RandomState],
+        told: Sequence[Instruction] | None = None,
+    ) -> tuple[np.ndarray, np.ndarray, list[Instruction]]:
+        """Draw a scene from each of b random streams.
+
+        Args:
+            streams: One for each scene.
+            told: What is to be said in each; None: it is drawn.
+
+        Returns:
+            Which body is in each slot [b, C], where [b, C, 2] [m], and what is said.
+
+        Raises:
+            GoalError: No scene was found of which an instruction is true.
+        """
+        wanted = [None] * len(streams) if told is None else told
+        each = [self._draw(*pair) for pair in zip(streams, wanted, strict=True)]
+        slots, places, said = zip(*each, strict=True)
+        return np.stack(slots), np.stack(places), list(said)
+
+    def _draw(
+        self, stream: np.random.RandomState, told: Instruction | None
+    ) -> tuple[np.ndarray, np.ndarray, Instruction]:
+        rng = Random(int(stream.uniform() * 2**53))
+        wanted = told
+        if told is None and self.spoken.split == "wording" and rng.random() < BY_HAND:
+            wanted = self.by_hand[int(rng.random() * len(self.by_hand))]
+        for _ in range(SCENES):
+            slot, xy = self.layout.lay_out(stream.uniform(size=(1, self.layout.noise)))
+            there = self._things(slot[0], xy[0])
+            if wanted is None:
+                instruction = self._say(there, rng)
+            else:
+                free = told is not None  # what users ask for need not be in reach
+                fits = self.is_true(wanted.goal, there) and (
+                    free or self.can_ask(wanted.goal, there)
+                )
+                instruction = wanted if fits else None
+            if instruction is not None:
+                return slot[0], xy[0], instruction
+        raise GoalError(
+            f"instruction: got {wanted or self.spoken}, which is true of none of "
+            f"{SCENES} scenes"
+        )
+
+    def _things(self, slot: np.ndarray, xy: np.ndarray) -> list[Thing]:
+        """Return the objects that lie there, of slots [C] and places [C, 2]."""
+        return [
+            Thing(self.bodies[index].color, self.bodies[index].shape, *place)
+            for index, place in zip(slot.tolist(), xy.tolist(), strict=True)
+            if index >= 0
+        ]
+
+    def _say(self, scene: Sequence[Thing], rng: Random) -> Instruction | None:
+        """Return something to say of a scene; None: there is nothing."""
+        spoken, allows = self.spoken, self.layout.allows(scene)
+        try:
+            goal = draw(scene, spoken.kinds, rng, spoken.split, allows)
+        except GoalError:
+            return None
+        return Instruction(sentence(goal, rng, spoken.split), goal)
+
+    def is_true(self, goal: Goal, scene: Sequence[Thing]) -> bool:
+        """Return whether each of a goal's references fits one object of a scene."""
+        return None not in [resolve(ref, scene) for ref in goal.refs]
+
+    def can_ask(self, goal: Goal, scene: Sequence[Thing]) -> bool:
+        """Return whether a goal that is true can be asked for in training's scenes."""
+        allows, acts = self.layout.allows(scene), []
+        for verb, ref in acts_of(goal):
+            index = resolve(ref, scene)
+            assert index is not None
+            color, shape, *_ = scene[index]
+            if status(verb, color, shape) != "train":
+                return False
+            acts.append((verb, index))
+        together = [acts] if kind_of(goal) == "both" else [[act] for act in acts]
+        return all(map(allows, together))
+
+
+def resolve(ref: Ref, scene: Sequence[Thing]) -> int | None:
+    """Return which object of a scene a reference fits; None: none, or several."""
+    objects = [TouchObject(color, (x, y), shape) for color, shape, x, y in scene]
+    fits = ref.resolve(scene_of(objects))[0].nonzero().flatten().tolist()
+    return fits[0] if len(fits) == 1 else None
+
+
+def sentence(goal: Goal, rng: Random, split: str) -> str:
+    """Return a sentence for a goal, in the wording of a split."""
+    while True:
+        text = say(goal, rng, wording=split == "wording")
+        if len(split_words(text)) <= Spoken.MAX_TOKENS:
+            return text

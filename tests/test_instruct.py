@@ -1,0 +1,267 @@
+"""Free scenes and spoken sentences: what holds for all ids and splits."""
+
+from collections.abc import Iterator
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+from ir_maniskill import experiment as catalog
+from ir_maniskill.environment.layout import layout_of
+from ir_maniskill.environment.robots import Nao
+from ir_maniskill.environment.speaker import Speaker, resolve
+from ir_maniskill.experiment import Drawn, Experiment, ExperimentError, Spoken
+from ir_maniskill.goals import COLORS, SHAPES, Instruction, Push, Ref, Touch
+from ir_maniskill.language import (
+    HELD_OBJECTS,
+    SPLITS,
+    handwritten,
+    kind_of,
+    parse,
+    split_of,
+)
+from ir_maniskill.language.splits import acts_of
+from ir_maniskill.language.tokens import split_words
+from ir_maniskill.tasks import instruct
+
+TASKS = (
+    instruct.TOUCH,
+    instruct.HAND,
+    instruct.PUSH,
+    instruct.WHERE,
+    instruct.THEN,
+    instruct.ALL,
+)
+
+
+@pytest.fixture(scope="module")
+def env() -> Iterator[gym.Env]:
+    kwargs = {"obs_mode": "state_dict", "render_backend": "none"}
+    env = gym.make("NaoInstruct-v1", control_mode="pd_joint_target_delta_pos", **kwargs)
+    yield env
+    env.close()
+
+
+def drawn(task: Experiment, split: str, count: int, seed: int = 0) -> list:
+    """Return scenes [C], places [C, 2] and instructions of a task's split."""
+    task = task.in_split(split)
+    speaker = Speaker(task, layout_of(task, Nao))
+    streams = [np.random.RandomState(seed + i) for i in range(count)]
+    return list(zip(*speaker.draw(streams), strict=True))
+
+
+# -- Scenes ----------------------------------------------------------------------------
+
+
+def test_objects_lie_apart_within_reach_and_no_two_are_alike() -> None:
+    counts = set()
+    for slot, xy, _ in drawn(instruct.TOUCH, "train", 300):
+        there = slot >= 0
+        places = xy[there]
+        gaps = np.linalg.norm(places[:, None] - places[None], axis=-1)
+        assert (gaps + np.eye(len(places)) >= 0.065).all()
+        away = np.linalg.norm(places[:, None] - np.array(Nao.shoulders), axis=-1)
+        assert (away.min(axis=1) <= Nao.reach).all()
+        assert len(set(slot[there])) == there.sum()
+        counts.add(int(there.sum()))
+    assert counts == {2, 3, 4, 5}
+
+
+def test_of_24_kinds_all_are_drawn_equally_often() -> None:
+    scenes = drawn(instruct.TOUCH, "train", 1000)
+    slots = np.concatenate([slot[slot >= 0] for slot, _, _ in scenes])
+    counts = np.bincount(slots, minlength=24)
+    assert len(counts) == 24 and counts.min() > 0.6 * counts.mean()
+
+
+def test_what_is_drawn_depends_on_the_seed_alone() -> None:
+    alone = drawn(instruct.ALL, "train", 1, seed=7)[0]
+    among = drawn(instruct.ALL, "train", 9, seed=0)[7]
+    assert (alone[0] == among[0]).all() and alone[2] == among[2]
+
+
+# -- Sentences -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("task", TASKS, ids=lambda task: task.id)
+@pytest.mark.parametrize("split", SPLITS)
+def test_sentences_are_of_their_split_and_true_of_their_scene(
+    task: Experiment, split: str
+) -> None:
+    written = {i.text: i.goal for i in handwritten()}
+    for slot, xy, said in drawn(task, split, 60):
+        speaker = Speaker(task, layout_of(task, Nao))
+        scene = speaker._things(slot, xy)
+        assert speaker.is_true(said.goal, scene)
+        assert kind_of(said.goal) in task.instructions.kinds
+        assert written.get(said.text) == said.goal or parse(said.text) == said.goal
+        new = split if split in ("objects", "pairs") else "train"
+        assert split_of(said.goal) == new
+        if split != "objects":
+            meant = [resolve(ref, scene) for _, ref in acts_of(said.goal)]
+            kinds = [(scene[i].color, scene[i].shape) for i in meant]
+            assert not set(kinds) & HELD_OBJECTS
+            held = [task.objects.is_held_out(scene[i].x, scene[i].y) for i in meant]
+            assert all(held) if split == "places" else not any(held)
+
+
+def test_training_has_thousands_of_sentences_of_forty_words() -> None:
+    texts = {said.text for _, _, said in drawn(instruct.ALL, "train", 1000)}
+    assert len(texts) > 900
+    known = instruct.ALL.vocabulary
+    assert len(known) > 42
+    words = {word for text in texts for word in split_words(text)}
+    assert len(words) > 60 and words <= set(known)
+
+
+# -- Episodes --------------------------------------------------------------------------
+
+
+def play(env: gym.Env, seed: int, steps: int = 8) -> list[torch.Tensor]:
+    """Return what is observed of an episode of random actions."""
+    obs, _ = env.reset(seed=seed)
+    generator, seen = torch.Generator().manual_seed(seed), []
+    for _ in range(steps):
+        seen.append(torch.cat([x.flatten() for x in obs["extra"].values()]))
+        obs, *_ = env.step(2 * torch.rand(1, 26, generator=generator) - 1)
+    return seen
+
+
+def test_the_same_seed_gives_the_same_episode_whatever_was_before(env: gym.Env) -> None:
+    first = play(env, 3)
+    play(env, 4)
+    for a, b in zip(first, play(env, 3), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_what_is_not_on_the_table_is_not_simulated(env: gym.Env) -> None:
+    env.reset(seed=1)
+    base = env.unwrapped
+    there = set(base.table.slot.flatten().tolist()) - {-1}
+    for index, body in enumerate(base.objects):
+        (part,) = body._bodies
+        assert part.is_enabled == (index in there)
+    scene = base.snapshot()
+    empty = scene.color < 0
+    assert empty.sum() == 5 - len(there)
+    assert not scene.pose[empty].any() and (scene.shape[empty] == -1).all()
+    on_table = scene.pose[~empty]
+    assert (on_table[:, 2] > 0.03).all() and (on_table[:, 0] > 0.13).all()
+
+
+def test_objects_stay_where_they_are_put(env: gym.Env) -> None:
+    for seed in range(5):
+        env.reset(seed=seed, options={"reconfigure": False})
+        start = env.unwrapped.snapshot()
+        hold = env.unwrapped.agent.get_proprioception()
+        for _ in range(3):
+            env.step(torch.zeros_like(hold["target"]))
+        now = env.unwrapped.snapshot()
+        touched = now.contact.any(1)
+        assert (now.moved.norm(dim=-1)[~touched] < 2e-3).all(), start.shape
+
+
+def test_another_sentence_begins_anew_without_a_reset(env: gym.Env) -> None:
+    env.reset(seed=2)
+    base = env.unwrapped
+    for _ in range(4):
+        env.step(torch.rand(1, 26) - 0.5)
+    place = base.snapshot().pose
+    color = list(COLORS)[int(base.snapshot().color[0, 0])]
+    shape = SHAPES[int(base.snapshot().shape[0, 0])]
+    base.tell(f"Please touch the {color} {shape} with your left hand.")
+    (said,) = base.instructions
+    assert said.goal == Touch(Ref(color, shape), "left")
+    scene = base.snapshot()
+    assert torch.equal(scene.start, place) and not base.get_info()["wrong_once"].any()
+    assert (env.step(torch.zeros(1, 26))[0]["extra"]["instruction"][0] > 0).sum() > 5
+
+
+@pytest.mark.parametrize(
+    ("said", "message"),
+    [
+        (
+            "Fetch me a beer.",
+            "instruction: got 'Fetch me a beer.' .*got 'fetch'",
+        ),
+        ("Touch the one.", "expected exactly one"),
+        (3.5, "instruction: got 3.5, expected a sentence"),
+        (
+            ["Touch the cube."] * 2,
+            "instruction: got .'Touch the cube.', .* or a list of 1",
+        ),
+        (Instruction("touch it " * 30, Touch(Ref())), "at most 40 words"),
+    ],
+)
+def test_what_cannot_be_told_changes_nothing(
+    env: gym.Env, said: object, message: str
+) -> None:
+    env.reset(seed=5)
+    base = env.unwrapped
+    before = base.get_state(), base.instructions
+    with pytest.raises(ValueError, match=message):
+        base.tell(said)
+    assert torch.equal(before[0], base.get_state()) and before[1] == base.instructions
+
+
+def test_a_state_brings_back_objects_and_sentence(env: gym.Env) -> None:
+    env.reset(seed=6)
+    base = env.unwrapped
+    env.step(torch.zeros(1, 26))
+    state, said, scene = base.get_state(), base.instructions, base.snapshot()
+    env.reset(seed=9)
+    assert base.instructions != said
+    base.set_state(state)
+    now = base.snapshot()
+    assert base.instructions == said
+    torch.testing.assert_close(base.get_state(), state, atol=1e-7, rtol=0)
+    for name in ("pose", "start", "color", "shape", "stage"):
+        assert torch.equal(getattr(scene, name), getattr(now, name)), name
+
+
+def test_what_a_reset_is_told_is_true_of_its_scene(env: gym.Env) -> None:
+    for text in ("Touch the yellow cube.", "Push the orange can to the left."):
+        env.reset(seed=3, options={"instruction": text, "reconfigure": False})
+        assert env.unwrapped.get_language_instruction() == [text]
+
+
+# -- Bad input -------------------------------------------------------------------------
+
+
+def test_a_split_that_there_is_not_is_refused() -> None:
+    with pytest.raises(ExperimentError, match="split: got 'test', available: train"):
+        instruct.ALL.in_split("test")
+    with pytest.raises(ExperimentError, match="split of .*Single.*: got 'places'"):
+        catalog.get("NaoTouchCubeSingle-v1").in_split("places")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"count": (2, 25)}, "drawn count: got .*, expected .*1 to 24"),
+        ({"count": (3, 2)}, "drawn count"),
+        ({"count": (2, 12)}, "drawn count: got .* at most . objects in this area"),
+        ({"colors": ("pink",)}, "drawn colors: got 'pink'"),
+        ({"apart": 0.01}, "drawn apart: got 0.01"),
+        ({"area": ((0.0, 0.2), (-0.1, 0.1))}, "drawn area: got"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(changes: dict, message: str) -> None:
+    with pytest.raises(ExperimentError, match=message):
+        Drawn(**changes)
+
+
+def test_drawn_objects_need_spoken_sentences() -> None:
+    told = (Instruction("Push.", Push(Ref(), "left")),)
+    with pytest.raises(ExperimentError, match="instructions: got .*expected Spoken"):
+        Experiment("Mine-v1", Drawn(), told)
+    with pytest.raises(ExperimentError, match="kind: got 'sing', available: touch"):
+        Spoken(("sing",))
+
+
+def test_the_language_can_be_spoken_over_objects_that_lie_fixed() -> None:
+    cubes = catalog.get("NaoTouchCubeTriangle-v1").objects
+    task = Experiment("Mine-v1", cubes, Spoken(("touch", "where")))
+    for slot, _, said in drawn(task, "train", 20):
+        assert slot.tolist() == [0, 1, 2] and kind_of(said.goal) in ("touch", "where")
