@@ -124,8 +124,8 @@ def _prepare(
     seed: int,
     instruction: str | None,
     robot: str | None = None,
-) -> tuple[Policy, Experiment, tuple[int, ...]]:
-    """Check what both ask for; return the policy, the task and its sentences."""
+) -> tuple[Policy, Experiment, list[str] | None]:
+    """Check what both ask for; return the policy, the task and what to say."""
     require(episodes >= 1, "episodes", episodes, "at least 1")
     require(seed >= 0, "seed", seed, "at least 0")
     if not isinstance(policy, Policy):
@@ -138,4 +138,5 @@ def _prepare(
         hint = "; name its task, or say any_task (--any-task) to try it here" * other
         raise MismatchError(f"{error}{hint}") from error
     wanted = None if instruction is None else [instruction]
-    return policy, experiment, choose_instructions(experiment.sentences, wanted)
+    choose_instructions(experiment, wanted)
+    return policy, experiment, wanted

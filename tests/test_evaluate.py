@@ -30,7 +30,7 @@ class ScriptedEnvs:
 
     def reset(self, *, seed=None, options=None):
         self.seed = torch.arange(seed, seed + self.num_envs)
-        self.told = options["instruction"]
+        self.told = torch.tensor(options["instruction"])
         self.resets.append((seed, self.told.tolist()))
         self.t = 0
         self.once = torch.zeros(self.num_envs, dtype=torch.bool)

@@ -61,7 +61,7 @@ class ToyVectorEnv:
             self.streams = [np.random.default_rng(seed + i) for i in rows]
         self._start(torch.ones(self.num_envs, dtype=torch.bool))
         if options:
-            self.told[:] = options["instruction"]
+            self.told[:] = torch.tensor(options["instruction"])
         return self._observe(), {}
 
     def step(self, action):

@@ -23,9 +23,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ir_maniskill.checks import require
+from ir_maniskill.environment.arguments import instructions_of
 from ir_maniskill.environment.senses import State, StateStack
 from ir_maniskill.environment.vector import VectorEnv, info_of_step
+from ir_maniskill.experiment import Experiment
 from ir_maniskill.files import write_json
+from ir_maniskill.language import KINDS, kind_of
 
 Policy = Callable[[State], Tensor]
 """Maps the state s_t of N envs to their actions [N, 26] in [-1, 1]."""
@@ -127,7 +130,7 @@ class EvaluationReport:
     episodes: int
     """Episodes played."""
     instructions: dict[str, Score]
-    """Score of each sentence."""
+    """Score of each sentence; where they are spoken, of each kind of sentence."""
     overall: Score
     """Score over all episodes."""
 
@@ -164,8 +167,8 @@ def evaluate_policy(
 ) -> EvaluationReport:
     """Play episodes with a policy and count what it does.
 
-    Episodes are spread evenly over the instructions: episode e is told instruction
-    e modulo their number, and starts from seed + e.
+    Episode e starts from seed + e. The instructions take turns; where they are spoken,
+    each episode has a sentence of its own.
 
     Args:
         policy: Acts without noise on the state s_t.
@@ -179,21 +182,28 @@ def evaluate_policy(
     Raises:
         ValueError: Too few episodes, or an instruction that the task does not have.
     """
-    sentences = envs.experiment.sentences
-    chosen = choose_instructions(sentences, instructions)
+    chosen = choose_instructions(envs.experiment, instructions)
     if episodes < len(chosen):
         raise ValueError(
             f"episodes: got {episodes}, expected at least {len(chosen)}, "
             "one for each instruction"
         )
-    told = torch.tensor([chosen[e % len(chosen)] for e in range(episodes)])  # [E]
-    figures = _play(policy, envs, told, seed, StateStack(frames), progress)
+    told = [chosen[e % len(chosen)] for e in range(episodes)]
+    figures, names = _play(policy, envs, told, seed, StateStack(frames), progress)
+    groups = {name: [n == name for n in names] for name in _order(names)}
     return EvaluationReport(
         env_id=envs.experiment.id,
         seed=seed,
         episodes=episodes,
-        instructions={sentences[i]: _score(figures[told == i]) for i in chosen},
+        instructions={n: _score(figures[torch.tensor(g)]) for n, g in groups.items()},
         overall=_score(figures),
+    )
+
+
+def _order(names: Sequence[str]) -> list[str]:
+    """Return the different names: kinds in their order, sentences as they came."""
+    return sorted(
+        dict.fromkeys(names), key=lambda n: KINDS.index(n) if n in KINDS else 0
     )
 
 
@@ -225,8 +235,8 @@ def evaluate_scenes(
     require(scenes >= 1, "scenes", scenes, "at least 1")
     obeyed = torch.ones(scenes, dtype=torch.bool)
     for index in range(len(envs.experiment.sentences)):
-        told = torch.full((scenes,), index)
-        figures = _play(policy, envs, told, seed, StateStack(frames), progress)
+        told = [index] * scenes
+        figures, _ = _play(policy, envs, told, seed, StateStack(frames), progress)
         obeyed &= figures[:, FIGURES.index("exclusive")] > 0
     return Rate(int(obeyed.sum()), scenes)
 
@@ -258,18 +268,23 @@ def machine() -> dict[str, Any]:
 
 
 def choose_instructions(
-    sentences: Sequence[str], wanted: Sequence[int | str] | None
-) -> tuple[int, ...]:
-    """Return the indices of the instructions to play.
+    experiment: Experiment, wanted: Sequence[int | str] | None
+) -> tuple[int | str | None, ...]:
+    """Return which instructions to play, as a reset takes them.
 
     Args:
-        sentences: The I sentences of the experiment.
-        wanted: Which of them, by index or, but for its case and its full stop, by the
-            sentence; None: all.
+        experiment: The task, with I sentences of its own or spoken ones.
+        wanted: Which, by index or, but for its case and its full stop, by the sentence;
+            None: all. Spoken ones are texts; None: each episode draws its own.
 
     Raises:
         ValueError: None is wanted, or one that there is not.
     """
+    sentences = experiment.sentences
+    if not sentences:
+        if wanted is not None:
+            instructions_of(list(wanted), experiment, len(wanted))
+        return (None,) if wanted is None else tuple(wanted)
     known = {_plain(sentence): index for index, sentence in enumerate(sentences)}
     found = range(len(sentences)) if wanted is None else wanted
     chosen = tuple(known.get(_plain(i), -1) if isinstance(i, str) else i for i in found)
@@ -307,23 +322,26 @@ def threads(count: int) -> Iterator[None]:
 def _play(
     policy: Policy,
     envs: VectorEnv,
-    told: Tensor,  # [E]
+    told: Sequence[int | str | None],  # [E]
     seed: int,
     stack: StateStack,
     progress: bool,
-) -> Tensor:
-    """Play all episodes, N at a time; episode e is told instruction told[e].
+) -> tuple[Tensor, list[str]]:
+    """Play all episodes, N at a time; episode e is told told[e], None: what is drawn.
 
     Returns:
-        `FIGURES` of each episode [E, 7] float64.
+        `FIGURES` of each episode [E, 7] float64, and the sentence or its kind [E].
     """
     episodes, n = len(told), envs.num_envs
+    names: list[str] = []
     figures = torch.zeros(episodes, len(FIGURES), dtype=torch.float64)
     firsts = range(0, episodes, n)
     for first in tqdm(firsts, "evaluate", disable=not progress, leave=False):
         episode = torch.arange(first, first + n)  # [N]
-        options = {"instruction": told[episode % episodes].to(envs.device)}
+        say = [told[e % episodes] for e in episode.tolist()]
+        options = {} if say[0] is None else {"instruction": say}
         obs, _ = envs.reset(seed=seed + first, options=options)
+        names += _names(envs, say)
         state = stack.reset(obs)
         playing = episode < episodes  # the last round may have envs to spare
         while playing.any():
@@ -335,7 +353,17 @@ def _play(
             figures[episode[playing], 2:] += step[:, 2:]
             playing &= ~done.cpu()
             state = stack.push(obs, done)
-    return figures
+    return figures, names[:episodes]
+
+
+def _names(envs: VectorEnv, told: Sequence[int | str | None]) -> list[str]:
+    """Return the sentence of each env; where they are spoken, its kind."""
+    sentences = envs.experiment.sentences
+    if sentences:
+        return [sentences[index] for index in told if isinstance(index, int)]
+    each = envs.get_attr("instructions")  # of N envs, or of N vectors of one
+    said = [i for one in each for i in (one if isinstance(one, list) else [one])]
+    return [kind_of(instruction.goal) for instruction in said]
 
 
 def _measured(reward: Tensor, info: dict[str, Tensor]) -> Tensor:

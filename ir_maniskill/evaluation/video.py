@@ -110,10 +110,11 @@ def record(
     """
     with closing(gym.make(env_id, num_envs=1, **(env_kwargs or {}))) as env:
         base: Any = env.unwrapped
-        told = choose_instructions(base.experiment.sentences, instructions)
+        told = choose_instructions(base.experiment, instructions)
         with closing(_stage(env_id, base.agent)) as stage:
             for episode in range(episodes):
-                options = {"instruction": told[episode % len(told)]}
+                said = told[episode % len(told)]
+                options = {} if said is None else {"instruction": said}
                 obs, _ = env.reset(seed=seed + episode, options=options)
                 yield from _play(policy, env, obs, StateStack(frames), stage)
 
