@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+import ir_maniskill
 from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.layout import layout_of
 from ir_maniskill.environment.robots import Nao
@@ -265,3 +266,45 @@ def test_the_language_can_be_spoken_over_objects_that_lie_fixed() -> None:
     task = Experiment("Mine-v1", cubes, Spoken(("touch", "where")))
     for slot, _, said in drawn(task, "train", 20):
         assert slot.tolist() == [0, 1, 2] and kind_of(said.goal) in ("touch", "where")
+
+
+# -- Vectors, senses and splits of all ids ---------------------------------------------
+
+
+@pytest.mark.parametrize("task", TASKS, ids=lambda task: task.id)
+def test_spaces_do_not_depend_on_the_split(task: Experiment) -> None:
+    kwargs = {"obs_mode": "state_dict", "render_backend": "none"}
+    spaces = []
+    for split in ("train", "places"):
+        env = gym.make(task.id, split=split, **kwargs)
+        spaces.append(env.observation_space)
+        obs, _ = env.reset(seed=0)
+        assert env.observation_space.contains(
+            {part: {k: v.numpy() for k, v in obs[part].items()} for part in obs}
+        )
+        assert obs["extra"]["instruction"].shape == (1, Spoken.MAX_TOKENS)
+        assert env.unwrapped.experiment.instructions.split == split
+        env.close()
+    assert spaces[0] == spaces[1]
+
+
+def test_a_vector_plays_what_single_envs_play() -> None:
+    kwargs = {"obs_mode": "state_dict", "render_backend": "none"}
+    envs = ir_maniskill.make_vec("NaoInstruct-v1", 3, split="pairs", **kwargs)
+    try:
+        obs, _ = envs.reset(seed=11)
+        said = envs.call("get_language_instruction")
+        alone = gym.make("NaoInstruct-v1", split="pairs", **kwargs)
+        first, _ = alone.reset(seed=13)
+        assert said[2] == alone.unwrapped.get_language_instruction()
+        row = {k: v[2] for k, v in obs["extra"].items()}
+        assert all(torch.equal(row[k], first["extra"][k][0]) for k in row)
+        alone.close()
+        envs.reset(seed=1, options={"instruction": "Touch the yellow can."})
+        assert envs.call("get_language_instruction")[1] == ["Touch the yellow can."]
+        with pytest.raises(
+            ValueError, match="got 'Sing.' .*'sing' as word"
+        ):
+            envs.reset(options={"instruction": "Sing."})
+    finally:
+        envs.close()

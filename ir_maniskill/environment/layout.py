@@ -21,10 +21,21 @@ CANDIDATES = 40
 """Places that are tried for each object; if none is free it is left out."""
 NAMED_FIRST = 2
 """How many objects lie in the part held out, where only such may be named."""
-ROOM_BEHIND = 0.09
-"""Free way that a hand needs behind an object to push it [m]."""
-ROOM_ASIDE = 0.055
-"""Free way beside the line along which an object is pushed [m]."""
+
+# What a hand can do, as found with NAO's scripted solution: `evaluation/scripted.py`.
+ACROSS = 0.04
+"""How far past the middle line a hand touches [m]."""
+INNER = 0.145 / 0.255
+"""Nearest to its shoulder that a fingertip pushes, as a share of the reach."""
+BEHIND, AT_END = 0.036, 0.023
+"""Where the fingertip is when a push begins, behind the object's place, and when it
+ends, beyond that [m]."""
+PUSHES = {"outward": (0.05, math.inf), "inward": (0.02, 0.19), "away": (0.02, math.inf)}
+"""How far to the hand's own side the object may lie (least, most) [m]."""
+FREE_AHEAD, FREE_BEHIND = 0.06, 0.05
+"""Distance of others from where a pushed object goes, and from the hand [m]."""
+BETWEEN_HANDS = 0.06
+"""By how much the left hand's object must be further left than the other's [m]."""
 
 Laid = tuple[np.ndarray, np.ndarray]
 """Which body is in each slot [b, C] int64, and where [b, C, 2] [m]."""
@@ -60,10 +71,9 @@ class Free:
     def __init__(self, drawn: Drawn, robot: Robot, split: str) -> None:
         self.drawn = drawn
         self.split = split
-        scale = robot.scale
-        self.shoulders = np.array(robot.shoulders) / scale  # [hands, 2]
-        self.reach = robot.reach / scale
-        self.hands = dict(zip(robot.hands, self.shoulders, strict=False))
+        self.reach = robot.reach / robot.scale
+        shoulders = [np.array(place) / robot.scale for place in robot.shoulders]
+        self.hands = dict(zip(robot.hands, shoulders, strict=False))
         self.slots = drawn.count[1]
         self.noise = 1 + len(drawn.pool) + 2 * self.slots * CANDIDATES
         """Uniform numbers that a scene is made of."""
@@ -96,7 +106,7 @@ class Free:
         xy = np.zeros((*wanted.shape, 2))
         found = np.zeros(wanted.shape, dtype=bool)
         for slot in range(self.slots):
-            fits = np.any(self.reached(tried[:, slot]), axis=-1)  # [b, K]
+            fits = self.reached(tried[:, slot])  # [b, K]
             for other in range(slot):
                 gap = np.linalg.norm(tried[:, slot] - xy[:, None, other], axis=-1)
                 fits &= (gap >= self.drawn.apart) | ~found[:, None, other]
@@ -105,9 +115,8 @@ class Free:
         return found, xy
 
     def reached(self, xy: np.ndarray) -> np.ndarray:
-        """Return which arms reach places [..., 2] [m]: [..., arms] bool."""
-        away = np.linalg.norm(xy[..., None, :] - self.shoulders, axis=-1)
-        return away <= self.reach
+        """Return whether some hand touches what is at these places [..., 2]: [...]."""
+        return np.any([self._touches(hand, xy) for hand in self.hands], axis=0)
 
     # -- What can be asked -----------------------------------------------------------
 
@@ -121,52 +130,67 @@ class Free:
         return allowed
 
     def _can(self, verb: str, index: int, things: Sequence[Thing]) -> bool:
-        _, _, x, y = things[index]
+        *_, x, y = things[index]
         held_out = self.drawn.is_held_out(x, y)
         first, _, last = verb.partition(" ")
         if first == "name":
             return self.split == "places" or not held_out
         if held_out != (self.split == "places"):
             return False
-        if last == "hand":
-            return self._hand_reaches(first, x, y)
-        return first != "push" or self._can_push(last, index, things)
+        if first == "push":
+            return self._can_push(last, index, things)
+        hands = [first] if last == "hand" else self.hands
+        return any(self._touches(hand, np.array((x, y))) for hand in hands)
 
-    def _hand_reaches(self, hand: str, x: float, y: float) -> bool:
-        there = math.dist((x, y), self.hands[hand]) if hand in self.hands else math.inf
-        return there <= self.reach
+    def _touches(self, hand: str, xy: np.ndarray) -> np.ndarray:
+        """Return whether a hand touches what is at these places [..., 2]: [...]."""
+        if hand not in self.hands:
+            return np.zeros(xy.shape[:-1], dtype=bool)
+        shoulder = self.hands[hand]
+        near = np.linalg.norm(xy - shoulder, axis=-1) <= self.reach
+        return near & (np.sign(shoulder[1]) * xy[..., 1] >= -ACROSS)
 
     def _can_push(self, direction: str, index: int, things: Sequence[Thing]) -> bool:
-        """Return whether there is room to push, and an arm reaches all the way."""
+        """Return whether a hand can get behind an object, and push it all the way."""
         ahead = np.array(DIRECTIONS[direction][:2])
-        start = np.array(things[index][2:])
-        end = start + Push.distance * ahead
+        place = np.array(things[index][2:])
         others = np.array([t[2:] for i, t in enumerate(things) if i != index])
-        if not (self.reached(start) & self.reached(end)).any():
+        if len(others):
+            along = ((others - place) @ ahead).clip(0, Push.distance)
+            line = place + along[:, None] * ahead  # the nearest of it to each
+            free = np.linalg.norm(others - line, axis=1) > FREE_AHEAD
+            room = np.linalg.norm(others - place + BEHIND * ahead, axis=1) > FREE_BEHIND
+            if not (free & room).all():
+                return False
+        return any(
+            self._pushes(shoulder, place, ahead) for shoulder in self.hands.values()
+        )
+
+    def _pushes(
+        self, shoulder: np.ndarray, place: np.ndarray, ahead: np.ndarray
+    ) -> bool:
+        """Return whether the arm of a shoulder reaches all along a push."""
+        side = np.sign(shoulder[1])
+        ways = {1.0: "outward", -1.0: "inward", 0.0: "away"}
+        least, most = PUSHES[ways[float(side * ahead[1])]]
+        if side and not least <= side * place[1] <= most:
             return False
-        if not len(others):
-            return True
-        along = (others - start) @ ahead
-        aside = np.abs((others - start) @ ahead[::-1])
-        room = Push.distance + self.drawn.apart
-        near = (along > -ROOM_BEHIND) & (along < room) & (aside < ROOM_ASIDE)
-        return not near.any()
-        return not (
-            (along > -ROOM_BEHIND) & (along < room) & (aside < ROOM_ASIDE)
-        ).any()
+        ends = place + np.array([[-BEHIND], [AT_END]]) * ahead
+        away = np.linalg.norm(ends - shoulder, axis=1)
+        return bool(((INNER * self.reach <= away) & (away <= self.reach)).all())
 
     def _can_both(
         self, acts: Sequence[tuple[str, int]], things: Sequence[Thing]
     ) -> bool:
         """Return whether two hands reach one object each, without crossing."""
         acts = sorted(acts, key=lambda act: -things[act[1]].y)  # from left to right
+        places = np.array([things[index][2:] for _, index in acts])
         verbs = tuple(verb for verb, _ in acts)
+        if places[0, 1] - places[1, 1] < BETWEEN_HANDS:
+            return False
         if "touch" not in verbs:
             return verbs == ("left hand", "right hand")
-        return all(
-            self._hand_reaches(hand, *things[index][2:])
-            for hand, (_, index) in zip(("left", "right"), acts, strict=True)
-        )
+        return all(map(self._touches, ("left", "right"), places))
 
 
 def layout_of(experiment: Experiment, robot: Robot) -> Seats | Free:

@@ -56,20 +56,12 @@ class TableObjects:
         self._kinds = torch.tensor(kinds, device=device)  # [B, 2]
         z = [scale * (table_scene.TABLE_TOP + h) for h in height]
         self._z = torch.tensor(z, dtype=torch.float32, device=device)  # [B] [m]
-        shape = scene.num_envs, experiment.slots
-        self.slot = torch.full(shape, EMPTY, device=device)
         self._gpu = scene.gpu_sim_enabled
         self._shown = [True] * len(things)  # on the CPU: whether they are simulated
-
-    @property
-    def color(self) -> Tensor:
-        """Place of each object's color in `COLORS`, -1 in empty slots [N, C] int64."""
-        return self._kinds[self.slot, 0].where(self.slot >= 0, EMPTY)
-
-    @property
-    def shape(self) -> Tensor:
-        """Place of each object's shape in `SHAPES`, -1 in empty slots [N, C] int64."""
-        return self._kinds[self.slot, 1].where(self.slot >= 0, EMPTY)
+        shape = scene.num_envs, experiment.slots
+        self.slot = torch.full(shape, EMPTY, device=device)
+        """Which body is in each slot, or `EMPTY` [N, C] int64."""
+        self.put(slice(None), self.slot)
 
     # -- Where they are --------------------------------------------------------------
 
@@ -103,6 +95,10 @@ class TableObjects:
         """Say which bodies lie on the table, wherever they are."""
         self.slot = self.slot.clone()
         self.slot[env_idx] = slot
+        kinds = self._kinds[self.slot].where((self.slot >= 0)[..., None], EMPTY)
+        self.color, self.shape = kinds.unbind(dim=-1)
+        """Places of their colors in `COLORS`, and of their shapes in `SHAPES`, -1 in
+        empty slots [N, C] int64."""
         if self._drawn and not self._gpu:
             on_table = set(self.slot.flatten().tolist())
             for index in range(len(self.bodies)):
