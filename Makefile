@@ -13,7 +13,7 @@ BIN         := $(VENV)/bin
 IR          := $(BIN)/ir-maniskill
 PACKAGES    := $(VENV)/.stamp-packages
 VULKAN      := $(VENV)/.stamp-vulkan
-SOURCES     := ir_maniskill tasks assets tests examples scripts
+SOURCES     := ir_maniskill ir_maniskill_cli.py tasks assets tests examples scripts
 PYTEST      := $(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 
 export TORCH_INDEX
@@ -71,11 +71,11 @@ format: $(PACKAGES)  ## let ruff format and fix what it can
 wheel: $(VULKAN)  ## build the wheel, install it in a clean environment, step a task
 	scripts/check_wheel.sh $(VENV)
 
-docs: $(PACKAGES)  ## write the API reference to docs/api
-	$(BIN)/python scripts/api_docs.py
+docs: $(PACKAGES)  ## write the pages and the API reference as a site, to docs/site
+	$(BIN)/python scripts/write_docs.py
 
 doctor: $(PACKAGES)  ## say whether this machine can render, and what to install if not
 	@$(BIN)/python -I ir_maniskill/doctor.py
 
 clean:  ## remove what make made, except runs/
-	rm -rf $(VENV) build dist docs/api *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	rm -rf $(VENV) build dist docs/site *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -112,7 +112,8 @@ def record(
         env_kwargs=policy.env_kwargs,
         instructions=chosen,
     )
-    video.write_video(path, steps, speed=speed)
+    total = episodes * (experiment.episode_steps + 1)
+    video.write_video(path, steps, speed=speed, total=total)
     return path
 
 

@@ -13,7 +13,7 @@ trap 'rm -rf "$work"' EXIT
 
 # A copy of the sources, so that no build folder of an earlier version slips in.
 mkdir "$work/source"
-cp -r "$root"/{pyproject.toml,README.md,LICENSE,ir_maniskill,tasks,assets} "$work/source"
+cp -r "$root"/{pyproject.toml,README.md,LICENSE,ir_maniskill,ir_maniskill_cli.py,tasks,assets} "$work/source"
 "$python" -m pip wheel --quiet --no-deps --no-build-isolation \
     --wheel-dir "$work/dist" "$work/source"
 ls -sh "$work/dist"

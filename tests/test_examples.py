@@ -1,5 +1,6 @@
 """Every example runs as a user would run it."""
 
+import json
 import os
 import re
 import runpy
@@ -141,3 +142,39 @@ def test_training_then_evaluating_its_policy(tmp_path: Path) -> None:
     assert re.search(r"Touch the blue cube\. +1 ", out)
     for name in ("report.json", "video.mp4"):
         assert (tmp_path / "runs" / "evaluation" / name).stat().st_size > 1000
+
+
+# -- The notebook ----------------------------------------------------------------------
+
+CELLS = """
+import json, sys
+from IPython.core.interactiveshell import InteractiveShell
+shell = InteractiveShell.instance()
+for cell in json.loads(open(NOTEBOOK).read())["cells"]:
+    if cell["cell_type"] == "code":
+        source = "".join(cell["source"]).replace("_000", "")
+        done = shell.run_cell(source.replace("episodes=3", "episodes=1"))
+        done.raise_error()
+        print("shown:", type(done.result).__name__)
+"""
+"""Runs the cells of a notebook with tiny budgets, and says what each shows."""
+
+
+@pytest.mark.render
+@pytest.mark.slow
+def test_the_notebook_runs(tmp_path: Path) -> None:
+    notebook = EXAMPLES / "quickstart.ipynb"
+    cells = f"NOTEBOOK = {str(notebook)!r}\n{CELLS}"
+    (tmp_path / "cells.py").write_text(cells)
+    out = run(tmp_path, "-c", TINY, "cells.py")
+    shown = re.findall(r"^shown: (\w+)", out, re.M)
+    assert shown == ["Image", "Image", "NoneType", "Video", "NoneType", "Image"]
+    assert out.count("touched: True, and nothing else: True") == 3
+    assert "The best policy, of step" in out
+
+
+def test_the_notebook_is_small_and_has_no_outputs() -> None:
+    text = (EXAMPLES / "quickstart.ipynb").read_text()
+    cells = json.loads(text)["cells"]
+    assert len(text) < 10_000
+    assert all(cell.get("outputs", []) == [] for cell in cells)

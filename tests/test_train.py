@@ -413,8 +413,22 @@ def test_noise_and_penalties_follow_the_share_of_the_steps(tmp_path):
 def test_the_progress_tells_why_a_return_falls(tmp_path, capsys):
     run(toy_config(tmp_path, penalty_warmup=0.5, eval_interval=2 * UPDATE))
     shown = capsys.readouterr().err.replace("\r", "\n")
-    assert re.search(r"return .*, success .*, penalties 100%, noise 0.16 \|", shown)
-    assert re.search(r"\| policy at 1024: success .*, exclusive .*fingers", shown)
+    assert re.search(r"return .*, success .*, penalties 100%, noise 0.16\]", shown)
+    assert "evaluate: " in shown
+
+
+def test_every_evaluation_has_its_line_and_the_last_one_a_table(tmp_path, capsys):
+    run(toy_config(tmp_path, eval_interval=2 * UPDATE))
+    lines = capsys.readouterr().out.splitlines()
+    figures = r"success \d+%, worst sentence \d+%, exclusive .*fingers"
+    steps = [row["steps"] for row in rows(tmp_path, "evaluations")]
+    for line, step in zip(lines, steps, strict=False):
+        assert re.fullmatch(rf"step {step}: {figures}(, the best so far)?", line)
+    best = checkpoint.read(tmp_path / "best.safetensors").metadata["steps"]
+    title, head, *table = lines[len(steps) :]
+    assert f"step {best}," in title and head.startswith("instruction ")
+    assert all(map(str.startswith, table, SENTENCES)) and len(table) == 3
+    assert lines[0].endswith(", the best so far")
 
 
 def test_what_final_infos_say_of_episodes_that_go_on_does_not_count():

@@ -1,6 +1,8 @@
 """The range of Python that is stated, and the locked set of what is installed."""
 
 import re
+import subprocess
+import sys
 from importlib import metadata
 from pathlib import Path
 
@@ -94,3 +96,23 @@ def test_every_python_has_one_exact_version_of_each(python: str) -> None:
     assert all(re.fullmatch("==[^*]+", str(pin)) for pin in pins(python).values())
     only_later = pins("3.11").keys() - pins(python).keys()
     assert only_later <= {"ipython-pygments-lexers"}  # part of IPython 8 on 3.10
+
+
+# -- Types -----------------------------------------------------------------------------
+
+SCRIPT = """
+import ir_maniskill
+report = ir_maniskill.evaluate("NaoTouchCubeSingle-v1")
+wrong: int = report
+"""
+
+
+@pytest.mark.slow
+def test_a_script_elsewhere_sees_types(tmp_path: Path) -> None:
+    (tmp_path / "script.py").write_text(SCRIPT)
+    cache = str(ROOT / ".mypy_cache" / "elsewhere")
+    command = [sys.executable, "-m", "mypy", "--cache-dir", cache, "script.py"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    errors = [line for line in done.stdout.splitlines() if ": error: " in line]
+    assert len(errors) == 1 and "script.py:4: " in errors[0]
+    assert 'expression has type "EvaluationReport"' in errors[0]

@@ -105,9 +105,15 @@ def test_the_view_and_the_pictures_are_shown():
         assert share(frame, box, (200, 200, 200)) > 0.98
 
 
-def test_a_policy_without_pictures_can_be_shown():
-    blind = draw(Snapshot(**{**vars(snapshot()), "cameras": {}}))
-    assert share(blind, video.PICTURES[0], video.PAGE) == 1
+def test_a_policy_without_pictures_has_its_numbers_in_their_place():
+    numbers = {"touch": np.array([1.0, 0, 0, -0.5, 0, 7])}
+    frame = draw(dataclasses.replace(snapshot(), cameras={}, numbers=numbers))
+    x, y, width, height = video.NUMBERS
+    card = (frame[y + 26 : y + height, x : x + width] == video.INK).all(axis=-1)
+    heights = card.sum(axis=0)[18 + 25 : 18 + 312 : 52]  # in the middle of each bar
+    assert heights[0] == heights[5] == pytest.approx(160, abs=2)  # 7 counts as 1
+    assert heights[3] == pytest.approx(heights[0] / 2, abs=2)
+    assert heights[1] == heights[2] == heights[4] == 1
 
 
 @pytest.mark.parametrize("name, size", [("a.mp4", (1280, 720)), ("a.gif", (640, 360))])

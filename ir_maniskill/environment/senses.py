@@ -259,6 +259,17 @@ def flatten(obs: Observation) -> State:
     return state
 
 
+def felt(obs: Observation) -> dict[str, Any]:
+    """Return the numbers that the first env's body and simulator give [n] each."""
+    read = {t.name for t in _TERMS if t.encoder == "body"} | {"privileged"}
+    state = flatten(obs)
+    return {
+        name: state[name][0].flatten().numpy(force=True)
+        for name in state
+        if name in read
+    }
+
+
 class StateStack:
     """Turns observations into states s_t = [o_t, o_{t-1}, o_{t-2}] (Sec. III-A).
 

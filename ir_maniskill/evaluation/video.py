@@ -1,8 +1,8 @@
 """Videos: what the robot does, what it sees and feels, and what it was told.
 
 A frame is a dark page of 1280 x 720: the human view on the left, over a timeline of the
-episode; on the right the two pictures that the policy sees, a light for every finger,
-and the counters.
+episode; on the right the two pictures that the policy sees, or the numbers that it has
+in their place, a light for every finger, and the counters.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import errno
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from itertools import takewhile
 from pathlib import Path
@@ -27,7 +27,7 @@ from PIL import Image, ImageDraw, ImageFont
 from tqdm import tqdm
 
 from ir_maniskill.environment.robots.robot import Robot
-from ir_maniskill.environment.senses import StateStack, cameras
+from ir_maniskill.environment.senses import StateStack, cameras, felt
 from ir_maniskill.environment.table_scene import view
 from ir_maniskill.environment.touch_env import CONTROL_FREQ
 from ir_maniskill.evaluation.evaluate import Policy, choose_instructions, threads
@@ -45,6 +45,8 @@ TIMELINE: Box = (32, 664, 836, 24)
 """One cell for each step, below the human view."""
 PICTURES: tuple[Box, Box] = ((900, 124, 166, 332), (1082, 124, 166, 332))
 """The policy's pictures; of more cameras the first two."""
+NUMBERS: Box = (900, 100, 348, 356)
+"""What is observed where there are no pictures."""
 HANDS: Box = (900, 480, 348, 128)
 """The touch lights."""
 LEGEND = (902, 60)
@@ -91,6 +93,8 @@ class Snapshot:
     """Sum of the rewards so far."""
     history: tuple[tuple[bool, bool], ...]
     """For each step so far: whether the goal held, and whether there was a foul."""
+    numbers: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """What is observed, without pictures: each sense's numbers [n]."""
 
 
 def record(
@@ -170,6 +174,7 @@ def _play(
             total_steps=total,
             score=score,
             history=history,
+            numbers={} if cameras(obs) else felt(obs),
         )
         if step < total:
             with threads(1):
@@ -196,6 +201,8 @@ def draw(snapshot: Snapshot) -> np.ndarray:
     canvas = ImageDraw.Draw(page)
     for (name, picture), box in zip(snapshot.cameras.items(), PICTURES, strict=False):
         _draw_camera(page, name, picture, box)
+    if snapshot.numbers and not snapshot.cameras:
+        _draw_numbers(page, snapshot.numbers)
     font = _fitting(snapshot.instruction, LEGEND[0] - 60, 34)
     canvas.text((32, 66), snapshot.instruction, INK, font, anchor="lm")
     _draw_timeline(canvas, snapshot)
@@ -244,6 +251,23 @@ def _draw_camera(page: Image.Image, name: str, picture: np.ndarray, box: Box) ->
     canvas.text((x + 1, y - 10), title, FAINT, _font(12), anchor="ls")
     size = "{} x {}".format(*picture.shape)  # height x width
     canvas.text((x + wide, y - 10), size, DIM, _font(12), anchor="rs")
+
+
+def _draw_numbers(page: Image.Image, numbers: Mapping[str, np.ndarray]) -> None:
+    """Draw a row of bars for each sense, as high as its numbers, at most 1."""
+    x, y, width, height = NUMBERS
+    _paste_shape(page, NUMBERS, CARD, radius=10)
+    canvas = ImageDraw.Draw(page)
+    half = height / len(numbers) / 2
+    for row, (name, values) in enumerate(numbers.items()):
+        top, step = y + 2 * half * row, (width - 36) / len(values)
+        canvas.text((x + 18, top + 10), name.upper(), FAINT, _font(12))
+        canvas.text((x + width - 18, top + 10), f"{len(values)}", DIM, _font(12), "ra")
+        zero, high = top + half + 12, half - 18
+        for column, value in enumerate(np.clip(values, -1, 1)):
+            left, end = x + 18 + column * step, zero - high * value
+            bar = (left, min(zero, end), left + step - 2, max(zero, end))
+            canvas.rectangle(bar, INK)
 
 
 @cache
@@ -347,7 +371,12 @@ def _draw_counters(canvas: ImageDraw.ImageDraw, snapshot: Snapshot) -> None:
 
 
 def write_video(
-    path: Path, snapshots: Iterable[Snapshot], *, speed: float = 0.5, hold: float = 1.0
+    path: Path,
+    snapshots: Iterable[Snapshot],
+    *,
+    speed: float = 0.5,
+    hold: float = 1.0,
+    total: int | None = None,
 ) -> int:
     """Draw what `record` yields into an mp4, or a small GIF; return how many it were.
 
@@ -356,6 +385,7 @@ def write_video(
         snapshots: At least one.
         speed: 1 is real time.
         hold: How long the last frame of an episode stays [s].
+        total: How many snapshots to expect, for the progress bar.
 
     Raises:
         ValueError: Of another name, or where there is nothing to show.
@@ -366,7 +396,7 @@ def write_video(
 
     def frames() -> Iterator[np.ndarray]:
         nonlocal count
-        for snapshot in tqdm(snapshots, "film", unit=" frames", leave=False):
+        for snapshot in tqdm(snapshots, "film", total, leave=False, unit=" frames"):
             frame, last = draw(snapshot), snapshot.step == snapshot.total_steps
             count += 1
             yield from [frame] * (1 + round(hold * rate) * last)

@@ -75,7 +75,6 @@ class Runner:
         self.state = self._new_scenes()
         actions = math.prod(envs.single_action_space.shape or ())
         self.algorithm = algorithm(config, self.state, actions)
-        self.said = ""  # of the last evaluation, for the progress bar
 
     # -- The loop --------------------------------------------------------------------
 
@@ -87,20 +86,19 @@ class Runner:
         )
         self.newest = self.snapshot()
         self._write()  # shows at once that we can
-        silent, figures = distributed.rank() > 0, Figures()
+        silent = distributed.rank() > 0
         bar = tqdm(total=total, initial=self.steps, unit=" steps", disable=silent)
         with bar, self._kept_at_last():
             while True:
                 if self._evaluation_is_due():
                     self.evaluate()
-                    bar.set_postfix_str(_shown(figures) + self.said)
                 if self._due(self.config.checkpoint_interval, self.saved):
                     self.save()
                 if self.steps >= total:
                     break
                 figures = self.advance()
                 self.newest = self.snapshot()
-                bar.set_postfix_str(_shown(figures) + self.said)
+                bar.set_postfix_str(_shown(figures))
                 bar.update(self.steps - bar.n)
             self._write()
         distributed.from_first(self.confirm)
@@ -172,22 +170,27 @@ class Runner:
         if distributed.rank() == 0:  # at last: what has no record is made again
             self.folder.log("evaluations", self.steps, figures)
         self.evaluated = self.steps
-        self.said = f" | policy at {self.steps}: {_shown(figures)}"
 
     def _evaluate(self) -> Figures:
         agent = self.algorithm.agent
         report = self._report(agent, self.config.eval_episodes, EVAL_SEED)
         score = score_of(report, fingers=self.state["touch"].shape[2])
-        if score > self.best_score:
+        figures, better = figures_of(report), score > self.best_score
+        tqdm.write(
+            f"step {self.steps}: {_shown(figures)}" + ", the best so far" * better
+        )
+        if better:
             self.best_score = score
             self._keep(agent, self.steps, report)
-        return figures_of(report)
+        return figures
 
     def confirm(self) -> None:
         """Evaluate the best policy on other scenes than those it was chosen by."""
         agent, _, metadata = checkpoint.load_agent(self.folder.best)
         episodes = max(FINAL_EPISODES, len(self.envs.experiment.sentences))
         report = self._report(agent.to(self.device), episodes, FINAL_SEED)
+        tqdm.write(f"The best policy, of step {metadata['steps']}, in other scenes:")
+        tqdm.write(str(report))
         figures = self._keep(agent, metadata["steps"], report)
         text = json.dumps(figures, indent=2) + "\n"
         self.folder.write("evaluation.json", text.encode())
@@ -201,6 +204,7 @@ class Runner:
             episodes=episodes,
             seed=seed,
             frames=self.config.frames,
+            progress=True,
         )
         checkpoint.set_random_state(*random)
         return report
@@ -341,15 +345,16 @@ SHOWN = {
     "penalty": "penalties {:.0%}",
     "std": "noise {:.2f}",
     "eval/success": "success {:.0%}",
+    "eval/worst": "worst sentence {:.0%}",
     "eval/exclusive": "exclusive {:.0%}",
     "eval/holding": "holding {:.0%}",
     "eval/right_fingers": "{:.1f} fingers",
 }
-"""Figures that the progress bar shows, and how."""
+"""Figures that the progress bar and the lines of evaluations show, and how."""
 
 
 def _shown(figures: Figures) -> str:
-    """Return what the progress bar says of figures."""
+    """Return what is said of figures."""
     return ", ".join(SHOWN[k].format(figures[k]) for k in SHOWN if k in figures)
 
 
