@@ -1,18 +1,22 @@
 """Language System: the sentence i_t becomes G_t.
 
-Legend: N envs, L tokens, B bytes, M different sentences, D units of a token.
+Legend: N envs, L tokens, B bytes, M different sentences, D units of a token, V words.
 """
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from ir_maniskill.agent.config import AgentConfig
 from ir_maniskill.checks import require
+from ir_maniskill.environment.senses import read_text
+from ir_maniskill.language.lexicon import Lexicon, lexicon
 from ir_maniskill.language.tokens import PAD
 
 LAYERS, HEADS, WIDTH = 3, 2, 50
@@ -120,29 +124,79 @@ class TokenTransformer(LanguageEncoder):
         return self._encode(self._fitting(sentences)).index_select(0, which)
 
     def _fitting(self, sentences: Tensor) -> Tensor:
-        """Return the sentences [M, L] without padding beyond what can be read."""
-        if sentences[:, self.length :].any():  # PAD is 0
-            longest = int((sentences != PAD).sum(1).max())
-            raise ValueError(
-                f"instruction: got a sentence of {longest} tokens, expected at most "
-                f"{self.length}; say it in fewer words, or train an agent with a "
-                "larger language_length"
-            )
+        """Return the sentences [M, L] without the padding that all of them have."""
+        places = (sentences != PAD).any(dim=0).nonzero()
+        longest = int(places.max()) + 1 if len(places) else 1
+        _require_length(longest, self.length)
+        return sentences[:, :longest]
+
+    def _embed(self, sentences: Tensor) -> Tensor:
+        """Return the embeddings [M, L, D] of token ids [M, L]."""
         words = self.words.num_embeddings
         if sentences.numel() and sentences.max() >= words:
             raise ValueError(
                 f"instruction: got the token id {int(sentences.max())}, expected one "
                 f"of the {words} that this agent learned; its task has other words"
             )
-        return sentences[:, : self.length]
+        return self.words(sentences)
 
     def _encode(self, sentences: Tensor) -> Tensor:
         present = sentences != PAD  # [M, L]
-        tokens = self.words(sentences) + self.positions[: sentences.shape[1]]
+        tokens = self._embed(sentences) + self.positions[: sentences.shape[1]]
         for layer in self.layers:
             tokens = layer(tokens, present)  # [M, L, D]
         flat = tokens.masked_fill(~present[..., None], 0).flatten(1)
         return functional.pad(flat, (0, self.width - flat.shape[1]))
 
 
+def _require_length(length: int, longest: int) -> None:
+    if length > longest:
+        raise ValueError(
+            f"instruction: got a sentence of {length} tokens, expected at most "
+            f"{longest}; say it in fewer words, or train an agent with a larger "
+            "language_length"
+        )
+
+
+class LexiconTransformer(TokenTransformer):
+    """The same over the text: a word that it never learned is read as others.
+
+    Its embedding is the mixture of theirs that `Lexicon` gives. Sentences of known
+    words are read as `TokenTransformer` reads them, with the same weights.
+    """
+
+    reads = ("text",)
+
+    def __init__(self, config: AgentConfig) -> None:
+        """Make the untrained layers."""
+        super().__init__(config)
+        self.vocabulary = config.vocabulary
+
+    def forward(self, text: Tensor) -> Tensor:
+        """Return G_t [N, width] of the sentences' bytes [N, B].
+
+        Raises:
+            ValueError: A sentence is too long.
+        """
+        known = lexicon(self.vocabulary)
+        rows = b"".join(_ids(known, said, self.length) for said in read_text(text))
+        ids = np.frombuffer(rows, np.int64).reshape(len(text), self.length)
+        return super().forward(torch.tensor(ids, device=text.device))
+
+    def _embed(self, sentences: Tensor) -> Tensor:
+        words, mixtures = self.words.weight, lexicon(self.vocabulary).mixtures
+        shares = torch.tensor(mixtures, dtype=words.dtype, device=words.device)
+        every = torch.cat([words, shares @ words])  # [V + mixtures, D]
+        return functional.embedding(sentences, every, padding_idx=PAD)
+
+
+@lru_cache(100_000)
+def _ids(known: Lexicon, sentence: str, length: int) -> bytes:
+    """Return the ids of a sentence [L] int64, padded to a length, as bytes."""
+    ids = known.ids(sentence)
+    _require_length(len(ids), length)
+    return np.array(ids + [PAD] * (length - len(ids)), np.int64).tobytes()
+
+
 register("tokens", TokenTransformer)
+register("lexicon", LexiconTransformer)
