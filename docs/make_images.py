@@ -5,6 +5,7 @@ python docs/make_images.py nao NaoTouchCubeMulti-v1  # these
 """
 
 import argparse
+import textwrap
 from collections.abc import Callable
 from functools import partial
 from itertools import chain
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import torch
 from mani_skill.utils.sapien_utils import look_at
 from PIL import Image, ImageDraw, ImageFont
 
@@ -20,6 +22,7 @@ from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.senses import cameras
 from ir_maniskill.evaluation.evaluate import EVALUATION_SEED
 from ir_maniskill.evaluation.video import record, write_video
+from ir_maniskill.language import SPLITS
 from ir_maniskill.policy import load_policy
 
 FOLDER = Path(__file__).parent / "images"
@@ -113,6 +116,43 @@ def scenes() -> Image.Image:
     return page
 
 
+def instruct() -> Image.Image:
+    """Return scenes of the instruction language, a row for each split."""
+    width, height, columns, text = 300, 200, 4, 44
+    rows = len(SPLITS)
+    size = (GAP + columns * (width + GAP), rows * (24 + height + text + GAP))
+    page = Image.new("RGB", size, PAGE)
+    for row, split in enumerate(SPLITS):
+        top = row * (24 + height + text + GAP)
+        label(page, (GAP, top + 12), split, 16)
+        for column in range(columns):
+            left = GAP + column * (width + GAP)
+            view, said = glimpse(split, (width, height), seed=columns * row + column)
+            page.paste(view, (left, top + 24))
+            for line, words in enumerate(textwrap.wrap(said, 44)[:3]):
+                label(page, (left, top + 24 + height + 10 + 15 * line), words, 13)
+    return page
+
+
+def glimpse(split: str, size: tuple[int, int], seed: int) -> tuple[Image.Image, str]:
+    """Return a scene of a split of the language, and what is said."""
+    camera = {
+        "width": 2 * size[0],
+        "height": 2 * size[1],
+        "pose": look_at((0.60, 0.0, 0.52), (0.13, 0.0, 0.03)),
+        "fov": 0.56,
+    }
+    kwargs = {"render_mode": "rgb_array", "human_render_camera_configs": camera}
+    env: Any = gym.make("NaoInstruct-v1", split=split, enable_shadow=True, **kwargs)
+    env.reset(seed=seed)
+    rest = torch.as_tensor(env.unwrapped.agent.keyframes["rest"].qpos)
+    env.unwrapped.agent.robot.set_qpos(rest[None])  # hands off the objects
+    view = Image.fromarray(env.render()[0].cpu().numpy()).resize(size)
+    (said,) = env.unwrapped.get_language_instruction()
+    env.close()
+    return view, said
+
+
 def save(make: Callable[[], Image.Image], path: Path) -> None:
     """Write a picture, small."""
     page = make().quantize(256, dither=Image.Dither.FLOYDSTEINBERG)
@@ -137,7 +177,10 @@ def film(task: str, path: Path) -> None:
 
 def main() -> None:
     """Write what is asked for."""
-    pictures = {"nao": partial(save, hero), "tasks": partial(save, scenes)}
+    pictures = {
+        name: partial(save, make)
+        for name, make in (("nao", hero), ("tasks", scenes), ("instruct", instruct))
+    }
     films = {task: partial(film, task) for task in FILMS}
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("names", nargs="*", help=f"of {', '.join(pictures | films)}")

@@ -28,8 +28,8 @@ BUTTON_PROFILE = ((-0.012, 0.020), (0.006, 0.020), (0.011, 0.016), (0.012, 0.0))
 """(height, radius) of the button from the foot up, about its center [m]."""
 CAN_PROFILE = ((-0.0275, 0.0), (-0.0275, 0.020), (0.0275, 0.020))
 """(height, radius) of the can's side, about its center [m]."""
-LID_PROFILE = ((0.0275, 0.020), (0.0275, 0.0))
-"""The same of its lid."""
+LID_PROFILE = ((0.0280, 0.019), (0.0280, 0.0))
+"""The same of its lid, just above."""
 SEGMENTS = 12
 """Points per ring of what is round."""
 PYRAMID_EDGE, PYRAMID_HEIGHT = 0.044, 0.050
