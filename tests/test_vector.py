@@ -251,6 +251,10 @@ WRONG_RESETS = [
         r"\['env_states'\]: got float32 of shape \(2, 9\), expected .* 3 rows",
     ),
     (
+        {"options": {"reset_to_env_states": {"env_states": {}}, "instruction": 1}},
+        "got 'reset_to_env_states' and instruction 1, expected one",
+    ),
+    (
         {"options": {"reset_to_env_states": {"env_states": {"task": "none"}}}},
         r"\['env_states'\]\['task'\]: got <U4 of shape \(\)",
     ),
@@ -288,17 +292,18 @@ def test_each_env_is_reset_to_its_own_state(envs: ProcessVectorEnv) -> None:
     env.close()
     seen, trees, rows = zip(*sources, strict=True)
 
-    def reset(states: Any) -> dict[str, torch.Tensor]:
+    def reset(states: Any, seed: int | None = None) -> dict[str, torch.Tensor]:
         envs.reset(seed=0)
         options = {"reset_to_env_states": {"env_states": states}}
-        return envs.reset(options=options)[0]["extra"]
+        return envs.reset(seed=seed, options=options)[0]["extra"]
 
     tree = {
         kind: {key: torch.cat([t[kind][key] for t in trees]) for key in trees[0][kind]}
         for kind in trees[0]
     }
-    for states in (tree, arrays(tree), torch.cat(rows)):
-        obs = reset(states)
+    every = (tree, None), (arrays(tree), None), (torch.cat(rows), None), (tree, 5)
+    for states, seed in every:
+        obs = reset(states, seed)
         for row in range(3):
             for name, value in seen[row].items():
                 torch.testing.assert_close(obs[name][row], value[0])

@@ -92,6 +92,7 @@ def options_of(
         ValueError: There is another option, or a value cannot be used.
     """
     require_names(options, RESET_OPTIONS)
+    require_one_start(options)
     dealt = {
         name: _deal(name, value, experiment, num_envs)
         for name, value in options.items()
@@ -104,6 +105,16 @@ def require_names(options: Iterable[str], allowed: Sequence[str]) -> None:
     unknown = [name for name in options if name not in allowed]
     if unknown:
         raise ValueError(f"reset options: got {unknown}, expected some of {allowed}")
+
+
+def require_one_start(options: dict[str, Any]) -> None:
+    """Raise ValueError if both a state and an instruction are asked for."""
+    told, state = options.get("instruction"), options.get("reset_to_env_states")
+    if told is not None and state is not None:
+        raise ValueError(
+            f"reset options: got 'reset_to_env_states' and instruction {short(told)}, "
+            "expected one: a state has its instruction, which `tell` can change after"
+        )
 
 
 def actions_of(actions: Any, shape: tuple[int, ...] | None) -> np.ndarray:

@@ -21,7 +21,7 @@ from torch import Tensor
 from ir_maniskill import experiment as catalog
 from ir_maniskill.doctor import require_vulkan
 from ir_maniskill.environment import reward_generator, senses, table_scene
-from ir_maniskill.environment.arguments import instructions_of
+from ir_maniskill.environment.arguments import instructions_of, require_one_start
 from ir_maniskill.environment.instructional_set import GoalBatch, InstructionalSet
 from ir_maniskill.environment.layout import layout_of
 from ir_maniskill.environment.rendering import RenderedEnv
@@ -293,10 +293,12 @@ class TouchEnv(RenderedEnv):
                 drawing them, as text or index, one for all envs or b of them.
 
         Raises:
-            ValueError: There is no such instruction, or there are not b.
+            ValueError: There is no such instruction, there are not b, or a state is
+                asked for as well.
             GoalError: A sentence refers to no object of its scene, or to several.
         """
         options = dict(options or {})
+        require_one_start(options)
         if isinstance(seed, np.integer):
             seed = int(seed)  # gymnasium and ManiSkill know no others
         if seed is not None and not self._sim_device.is_cuda():
