@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import shlex
 import signal
 
 import pytest
@@ -94,6 +95,26 @@ def test_without_a_policy_the_error_tells_how_to_train(capsys, monkeypatch, tmp_
     monkeypatch.setattr(cli, "shipped", lambda name: tmp_path / name)
     line = fails(capsys, "evaluate", IDS[0])
     assert f"ir-maniskill train {IDS[0]}" in line and str(tmp_path) in line
+
+
+def test_what_is_printed_to_type_next_is_quoted(monkeypatch, tmp_path, capsys):
+    best = tmp_path / "my run's" / "best.safetensors"
+    monkeypatch.setattr(cli, "train", lambda *_, **__: best)
+    assert cli.run(["train", IDS[0], "--out", str(best.parent)]) == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    typed = shlex.split(last.removeprefix("Next: "))
+    assert typed == ["ir-maniskill", "evaluate", IDS[0], "--checkpoint", str(best)]
+
+
+def test_how_to_train_names_the_module_of_the_task(monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    task = "from ir_maniskill import experiment, register; import dataclasses\n"
+    task += f"task = experiment.get({IDS[0]!r})\n"
+    task += "register(dataclasses.replace(task, id='Quoted-v1'))\n"
+    (tmp_path / "quoted.py").write_text(task)
+    line = fails(capsys, "evaluate", "quoted:Quoted-v1")
+    assert "ir-maniskill train quoted:Quoted-v1" in line
 
 
 def test_an_unknown_instruction_lists_those_there_are(capsys, policy_file):
