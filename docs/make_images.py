@@ -6,7 +6,8 @@ python docs/make_images.py nao NaoTouchCubeMulti-v1  # these
 
 import argparse
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -21,7 +22,7 @@ import ir_maniskill  # noqa: F401 - registers the tasks
 from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.senses import cameras
 from ir_maniskill.evaluation.evaluate import EVALUATION_SEED
-from ir_maniskill.evaluation.video import record, write_video
+from ir_maniskill.evaluation.video import Snapshot, record, write_video
 from ir_maniskill.language import SPLITS
 from ir_maniskill.policy import load_policy
 
@@ -50,6 +51,9 @@ FILMS = (
     "NaoTouchButtonShuffled-v1",
 )
 """The tasks of which there is a film."""
+SHUFFLED = "NaoTouchCubeShuffled-v1"
+FAILURE = (EVALUATION_SEED + 35, 2)
+"""Seed and sentence of an episode in which the shipped policy touches a wrong cube."""
 
 
 def shoot(
@@ -161,18 +165,42 @@ def save(make: Callable[[], Image.Image], path: Path) -> None:
 
 def film(task: str, path: Path) -> None:
     """Write a film of the shipped policy, told every sentence in the same scene."""
+    told = range(len(catalog.get(task).sentences))
+    write_video(path, chain.from_iterable(episode(task, i) for i in told))
+
+
+def episode(
+    task: str, told: int, seed: int = EVALUATION_SEED, act: Any = None
+) -> Iterator[Snapshot]:
+    """Play one episode with the shipped policy, or with `act` in its place."""
     policy = load_policy(task)
-    play = partial(
-        record,
-        policy.agent.policy,
+    return record(
+        act or policy.agent.policy,
         task,
         episodes=1,
-        seed=EVALUATION_SEED,
+        seed=seed,
         frames=policy.config.frames,
         env_kwargs=policy.env_kwargs,
+        instructions=[told],
     )
-    told = range(len(catalog.get(task).sentences))
-    write_video(path, chain.from_iterable(play(instructions=[i]) for i in told))
+
+
+def failure(path: Path) -> None:
+    """Write a film of an episode in which the shipped policy fails."""
+    seed, told = FAILURE
+    write_video(path, episode(SHUFFLED, told, seed))
+
+
+def training(path: Path) -> None:
+    """Write a film of what training begins with, noise, and of what it leads to."""
+    torch.manual_seed(0)
+    noise = partial(episode, act=lambda _: torch.randn(1, 26).clamp(-1, 1))
+    shots = [
+        replace(shot, instruction=f"{said}: {shot.instruction}")
+        for said, play in (("Before training", noise), ("After", episode))
+        for shot in play(SHUFFLED, 1)
+    ]
+    write_video(path, shots)
 
 
 def main() -> None:
@@ -182,6 +210,7 @@ def main() -> None:
         for name, make in (("nao", hero), ("tasks", scenes), ("instruct", instruct))
     }
     films = {task: partial(film, task) for task in FILMS}
+    films |= {"failure": failure, "training": training}
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("names", nargs="*", help=f"of {', '.join(pictures | films)}")
     parser.add_argument("--folder", type=Path, default=FOLDER)

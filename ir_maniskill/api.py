@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from ir_maniskill import experiment as catalog
-from ir_maniskill.checks import require
+from ir_maniskill.checks import require, require_whole
+from ir_maniskill.environment.arguments import SEEDS
 from ir_maniskill.environment.vector import make_vec
 from ir_maniskill.evaluation import video
 from ir_maniskill.evaluation.evaluate import (
@@ -59,7 +60,7 @@ def evaluate(
         ValueError: There is no such sentence, or too few episodes.
     """
     robot = env_kwargs.get("robot_uids")
-    require(num_envs >= 1, "num_envs", num_envs, "at least 1")
+    require_whole("num_envs", num_envs, 1)
     policy, experiment, chosen = _prepare(
         policy, task, any_task, episodes, seed, instruction, robot
     )
@@ -98,7 +99,8 @@ def record(
     """
     path = Path(path)
     video.check_name(path)
-    require(0.05 <= speed <= 4, "speed", speed, "0.05 to 4")
+    plays = isinstance(speed, float | int) and 0.05 <= speed <= 4
+    require(plays, "speed", speed, "0.05 to 4")
     policy, experiment, chosen = _prepare(
         policy, task, any_task, episodes, seed, instruction
     )
@@ -127,8 +129,8 @@ def _prepare(
     robot: str | None = None,
 ) -> tuple[Policy, Experiment, list[str] | None]:
     """Check what both ask for; return the policy, the task and what to say."""
-    require(episodes >= 1, "episodes", episodes, "at least 1")
-    require(seed >= 0, "seed", seed, "at least 0")
+    require_whole("episodes", episodes, 1)
+    require_whole("seed", seed, 0, SEEDS[-1] - 2 * episodes)  # the last ones'
     if not isinstance(policy, Policy):
         policy = load_policy(policy)
     experiment = catalog.get(task or policy.env_id)

@@ -1,7 +1,9 @@
 """Checks of what is given, and the errors that they raise: got, expected, available."""
 
+import math
 import typing
 from collections.abc import Callable
+from numbers import Integral
 from typing import Any, Literal
 
 
@@ -35,6 +37,14 @@ def require_type(
 ) -> None:
     """Raise the error unless the value is of that type."""
     require(isinstance(got, kind), name, got, f"a {kind.__name__}", error)
+
+
+def require_whole(name: str, got: object, low: int, high: float = math.inf) -> None:
+    """Raise ConfigError unless the value is a whole number from `low` to `high`."""
+    whole = isinstance(got, Integral) and not isinstance(got, bool)
+    expected = f"{low} to {high}" if high < math.inf else f"at least {low}"
+    fits = whole and low <= got <= high  # type: ignore[operator]
+    require(fits, name, got, f"a whole number, {expected}")
 
 
 def require_fields(

@@ -91,7 +91,7 @@ class Train:
         with distributed.group():
             best = train(config, resume=self.resume)
             if distributed.rank() == 0:
-                task, file = self.config.env_id, shlex.quote(str(best))
+                task, file = map(shlex.quote, (self.config.env_id, str(best)))
                 print(f"The best policy is in {best}.")
                 print(f"Next: ir-maniskill evaluate {task} --checkpoint {file}")
 
@@ -118,8 +118,8 @@ class _Play:
         if self.checkpoint is None and not path.is_file():
             raise UsageError(
                 f"no policy for {task}: none was given and none ships with the package "
-                f"(looked for {path}). Train one: ir-maniskill train {task}; then "
-                f"add --checkpoint runs/{task}/best.safetensors"
+                f"(looked for {path}). Train one: ir-maniskill train {self.env_id}; "
+                f"then add --checkpoint runs/{task}/best.safetensors"
             )
         return path
 

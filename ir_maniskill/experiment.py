@@ -421,9 +421,10 @@ def get(experiment_id: str) -> Experiment:
     first, so that it can register its tasks.
 
     Raises:
-        ExperimentError: The module cannot be imported.
+        ExperimentError: It is no id, or the module cannot be imported.
         UnknownExperimentError: There is none; the message lists those there are.
     """
+    _require_type("task id", experiment_id, str)
     module, _, experiment_id = experiment_id.rpartition(":")
     if module:
         _import(module)

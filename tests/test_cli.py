@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import shlex
 import signal
 
 import pytest
@@ -96,6 +97,26 @@ def test_without_a_policy_the_error_tells_how_to_train(capsys, monkeypatch, tmp_
     assert f"ir-maniskill train {IDS[0]}" in line and str(tmp_path) in line
 
 
+def test_what_is_printed_to_type_next_is_quoted(monkeypatch, tmp_path, capsys):
+    best = tmp_path / "my run's" / "best.safetensors"
+    monkeypatch.setattr(cli, "train", lambda *_, **__: best)
+    assert cli.run(["train", IDS[0], "--out", str(best.parent)]) == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    typed = shlex.split(last.removeprefix("Next: "))
+    assert typed == ["ir-maniskill", "evaluate", IDS[0], "--checkpoint", str(best)]
+
+
+def test_how_to_train_names_the_module_of_the_task(monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    task = "from ir_maniskill import experiment, register; import dataclasses\n"
+    task += f"task = experiment.get({IDS[0]!r})\n"
+    task += "register(dataclasses.replace(task, id='Quoted-v1'))\n"
+    (tmp_path / "quoted.py").write_text(task)
+    line = fails(capsys, "evaluate", "quoted:Quoted-v1")
+    assert "ir-maniskill train quoted:Quoted-v1" in line
+
+
 def test_an_unknown_instruction_lists_those_there_are(capsys, policy_file):
     line = fails(
         capsys, "evaluate", IDS[0], "--checkpoint", str(policy_file),
@@ -112,6 +133,8 @@ def test_an_unknown_instruction_lists_those_there_are(capsys, policy_file):
         (["video", IDS[0], "--episodes", "-1"], "episodes: got -1"),
         (["video", IDS[0], "--speed", "0"], "speed: got 0"),
         (["video", IDS[0], "--out", "film.avi"], "film.avi"),
+        (["video", IDS[0], "--seed", str(2**32 - 2)], "seed: got 4294967294"),
+        (["evaluate", IDS[0], "--seed", str(2**32 - 100)], "seed: got 4294967196"),
         (["train", IDS[0], "--num-envs", "0"], "num_envs: got 0"),
         (["train", IDS[0], "--preset", "fast"], "default, vision, paper"),
         (["curve", "/nowhere"], "/nowhere"),

@@ -1,5 +1,6 @@
 """At home with ManiSkill, Gymnasium and Stable-Baselines3: what others wrote works."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from mani_skill.utils.wrappers import (
     FlattenRGBDObservationWrapper,
     RecordEpisode,
 )
+from mani_skill.utils.wrappers.cached_reset import CachedResetWrapper
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 from ir_maniskill import Experiment, Instruction, Ref, Touch, TouchObject, register
@@ -156,6 +158,75 @@ def test_maniskill_writes_our_info_into_its_videos(tmp_path: Path) -> None:
     env.step(env.action_space.sample())
     env.close()
     assert (tmp_path / "0.mp4").stat().st_size > 1000
+
+
+# -- Resets to a state -----------------------------------------------------------------
+
+
+def blind(task: str) -> Any:
+    """Make a task without pictures."""
+    return gym.make(
+        task,
+        obs_mode="state_dict",
+        control_mode="pd_joint_target_delta_pos",
+        render_backend="none",
+    )
+
+
+@pytest.fixture(scope="module", params=["NaoTouchCubeShuffled-v1", "NaoInstruct-v1"])
+def to_states(request: pytest.FixtureRequest) -> Iterator[tuple[Any, dict]]:
+    """An env of a task, and a state of another one: its tree, its row, its sentence."""
+    other, env = blind(request.param), blind(request.param)
+    other.reset(seed=1)
+    for action in np.random.default_rng(0).uniform(-1, 1, (4, 26)):
+        other.step(action)
+    base = other.unwrapped
+    states = {"tree": base.get_state_dict(), "row": base.get_state()}
+    yield env, states | {"said": base.get_language_instruction()}
+    other.close()
+    env.close()
+
+
+@pytest.mark.parametrize("more", [{}, {"reconfigure": True}, {"reconfigure": False}])
+@pytest.mark.parametrize("kind", ["tree", "row"])
+def test_a_reset_to_a_state_may_have_a_seed(
+    to_states: tuple[Any, dict], kind: str, more: dict
+) -> None:
+    env, states = to_states
+    for seed in (3, None):
+        to = {"reset_to_env_states": {"env_states": states[kind]}}
+        env.reset(seed=seed, options=to | more)
+        torch.testing.assert_close(env.unwrapped.get_state(), states["row"])
+        assert env.unwrapped.get_language_instruction() == states["said"]
+        env.step(np.zeros(26))
+    env.reset(seed=4)  # what follows is as ever
+    begun = env.unwrapped.get_state()
+    env.reset(seed=5)
+    env.reset(seed=4)
+    assert torch.equal(env.unwrapped.get_state(), begun)
+
+
+def test_a_state_and_another_instruction_are_refused(
+    to_states: tuple[Any, dict],
+) -> None:
+    env, states = to_states
+    to = {"reset_to_env_states": {"env_states": states["row"]}, "instruction": 0}
+    with pytest.raises(ValueError, match="and instruction 0, expected one"):
+        env.reset(options=to)
+
+
+@pytest.mark.parametrize("task", ["NaoTouchCubeShuffled-v1", "NaoInstruct-v1"])
+def test_maniskills_cached_resets_work_with_and_without_a_seed(task: str) -> None:
+    env = CachedResetWrapper(blind(task), config={"num_resets": 2, "seed": 0})
+    cached = env._cached_resets_env_states["task"]["start"]
+    for seed in (None, 5, None):
+        seen, _ = env.reset(seed=seed)
+        now = env.unwrapped.get_obs(env.unwrapped.get_info())
+        torch.testing.assert_close(seen, now)
+        start = env.unwrapped.get_state_dict()["task"]["start"]
+        assert (start == cached).all(dim=1).sum() == 1
+        env.step(env.action_space.sample())
+    env.close()
 
 
 # -- ManiSkill's PPO layout ------------------------------------------------------------

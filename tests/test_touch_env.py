@@ -211,7 +211,13 @@ def test_pictures_that_a_shader_pack_cannot_draw_are_refused() -> None:
     [
         ({"num_envs": 2, "sim_backend": "physx_cpu"}, "got 2, .*make_vec"),
         ({"experiment": None}, "experiment: got None, expected an Experiment or its"),
+        ({"num_envs": 0}, "num_envs: got 0, expected a whole number, at least 1"),
+        ({"num_envs": "2"}, "num_envs: got '2'"),
         ({"reward_weights": {"hold": -1}}, "reward_weights.hold: got -1"),
+        ({"reward_weights": {"hold": "1"}}, "reward_weights.hold: got '1'"),
+        ({"reward_weights": {"held": 1}}, "got {'held': 1}, expected .*hold, approach"),
+        ({"reward_weights": 3}, "reward_weights: got 3, expected a dict of some"),
+        ({"observe": 3}, "observe: got 3, available"),
     ],
 )
 def test_arguments_that_cannot_work_are_refused(wrong: dict, message: str) -> None:
@@ -231,9 +237,45 @@ def test_actions_of_all_kinds_are_taken_and_those_not_finite_refused(
     ):
         obs = fixed.step(action)[0]
         assert not any(leaf.requires_grad for leaf in leaves(obs).values())
-    for bad in (np.nan, np.inf):
-        with pytest.raises(ValueError, match="expected finite numbers"):
-            fixed.step(np.full(26, bad, np.float32))
+    assert fixed.step([0.0] * 26)[4]["elapsed_steps"].item() == 4
+    for bad, message in (
+        (np.full(26, np.nan, np.float32), "expected finite numbers"),
+        (torch.full((26,), torch.inf), "expected finite numbers"),
+        ([0.0] * 25, r"got shape \(25,\), expected \(1, 26\)"),
+        (torch.zeros(2, 26), r"got shape \(2, 26\)"),
+        (np.zeros(26, complex), "got complex numbers"),
+        ("left", "got ndarray .*, expected numbers"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            fixed.step(bad)
+    assert fixed.step(np.zeros(26))[4]["elapsed_steps"].item() == 5
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        *(
+            ({"seed": seed}, "seed: got")
+            for seed in (True, 1.5, "3", -1, 2**32, [1, 2])
+        ),
+        ({"options": "seed"}, "reset options: got 'seed', expected a dict"),
+        ({"options": {"reconfigure": "no"}}, "'reconfigure': got 'no', expected True"),
+        ({"options": {"instruction": True}}, "instruction: got True"),
+    ],
+)
+def test_resets_of_the_wrong_kind_are_refused(
+    fixed: gym.Env, wrong: dict, message: str
+) -> None:
+    fixed.reset(seed=0)
+    before = fixed.unwrapped.get_state()
+    with pytest.raises(ValueError, match=message):
+        fixed.reset(**wrong)
+    assert torch.equal(fixed.unwrapped.get_state(), before)
+
+
+def test_an_option_that_is_mistyped_is_told_of(fixed: gym.Env) -> None:
+    with pytest.warns(UserWarning, match="'instructon' not known here, only instruct"):
+        fixed.reset(options={"instructon": 1})
 
 
 def test_unknown_ids_and_modes_are_refused() -> None:

@@ -241,6 +241,58 @@ def test_curves_have_no_points_of_steps_made_again(tmp_path, interrupt):
     assert steps == [UPDATE * i for i in (1, 2, 3, 4)]
 
 
+@pytest.mark.parametrize("updates", [2, 4])  # of 4: in the middle, and at the end
+def test_a_run_whose_best_policy_is_lost_gets_another(tmp_path, updates):
+    config = toy_config(tmp_path, eval_interval=2 * UPDATE)
+    run(dataclasses.replace(config, total_steps=updates * UPDATE))
+    (tmp_path / "best.safetensors").unlink()
+    run(config, resume=True)
+    best = checkpoint.read(tmp_path / "best.safetensors").metadata
+    assert best["steps"] in (2 * UPDATE, 4 * UPDATE)
+    steps = [int(row["steps"]) for row in rows(tmp_path, "evaluations")]
+    assert steps == [2 * UPDATE, 4 * UPDATE]
+
+
+def test_a_best_policy_that_is_broken_is_refused_before_training(tmp_path, interrupt):
+    interrupt(3)
+    with pytest.raises(KeyboardInterrupt):
+        run(toy_config(tmp_path, eval_interval=UPDATE))
+    (tmp_path / "best.safetensors").write_bytes(b"cut short")
+    with pytest.raises(CheckpointError, match="best.safetensors"):
+        run(toy_config(tmp_path), resume=True)
+
+
+OFFICE = {
+    "a byte order mark": lambda text: "\ufeff" + text,
+    "semicolons": lambda text: text.replace(",", ";"),
+    "decimal commas": lambda text: text.replace(",", ";").replace(".", ","),
+}
+"""How office programs save a table."""
+
+
+@pytest.mark.parametrize("change", OFFICE.values(), ids=OFFICE)
+def test_a_run_goes_on_from_tables_that_office_programs_saved(tmp_path, change):
+    run(toy_config(tmp_path, total_steps=2 * UPDATE))
+    before = {name: rows(tmp_path, name) for name in ("metrics", "evaluations")}
+    for name in before:
+        table = tmp_path / f"{name}.csv"
+        table.write_bytes(change(table.read_bytes().decode()).encode())
+    run(toy_config(tmp_path, total_steps=3 * UPDATE), resume=True)
+    for name, there in before.items():
+        assert rows(tmp_path, name)[: len(there)] == there
+    assert [int(row["steps"]) for row in rows(tmp_path, "metrics")] == [
+        UPDATE * i for i in (1, 2, 3)
+    ]
+
+
+@pytest.mark.parametrize("text", ["step,return\n1,2\n", "steps,return\nmany,2\n"])
+def test_a_table_that_is_none_is_named(tmp_path, text):
+    run(toy_config(tmp_path, total_steps=UPDATE))
+    (tmp_path / "metrics.csv").write_text(text)
+    with pytest.raises(CheckpointError, match=r"metrics.csv: got .*a column `steps`"):
+        run(toy_config(tmp_path), resume=True)
+
+
 def test_a_run_goes_on_with_its_own_config_but_for_what_is_given(tmp_path):
     config = toy_config(tmp_path, total_steps=UPDATE, seed=3)
     run(config)

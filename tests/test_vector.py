@@ -236,6 +236,7 @@ WRONG_RESETS = [
     ({"seed": np.array([0.5, 1, 2])}, r"seed: got \[0.5, 1.0, 2.0\]"),
     ({"seed": True}, "seed: got True"),
     ({"options": {"instructon": 0}}, r"got \['instructon'\], expected some of .*recon"),
+    ({"options": 3}, "reset options: got 3, expected a dict"),
     ({"options": {"env_idx": [0]}}, "got 'env_idx', expected none"),
     ({"options": {"instruction": 3}}, "instruction: got 3, expected an index from 0"),
     ({"options": {"instruction": True}}, "instruction: got True"),
@@ -249,6 +250,10 @@ WRONG_RESETS = [
     (
         {"options": {"reset_to_env_states": {"env_states": torch.zeros(2, 9)}}},
         r"\['env_states'\]: got float32 of shape \(2, 9\), expected .* 3 rows",
+    ),
+    (
+        {"options": {"reset_to_env_states": {"env_states": {}}, "instruction": 1}},
+        "got 'reset_to_env_states' and instruction 1, expected one",
     ),
     (
         {"options": {"reset_to_env_states": {"env_states": {"task": "none"}}}},
@@ -288,17 +293,18 @@ def test_each_env_is_reset_to_its_own_state(envs: ProcessVectorEnv) -> None:
     env.close()
     seen, trees, rows = zip(*sources, strict=True)
 
-    def reset(states: Any) -> dict[str, torch.Tensor]:
+    def reset(states: Any, seed: int | None = None) -> dict[str, torch.Tensor]:
         envs.reset(seed=0)
         options = {"reset_to_env_states": {"env_states": states}}
-        return envs.reset(options=options)[0]["extra"]
+        return envs.reset(seed=seed, options=options)[0]["extra"]
 
     tree = {
         kind: {key: torch.cat([t[kind][key] for t in trees]) for key in trees[0][kind]}
         for kind in trees[0]
     }
-    for states in (tree, arrays(tree), torch.cat(rows)):
-        obs = reset(states)
+    every = (tree, None), (arrays(tree), None), (torch.cat(rows), None), (tree, 5)
+    for states, seed in every:
+        obs = reset(states, seed)
         for row in range(3):
             for name, value in seen[row].items():
                 torch.testing.assert_close(obs[name][row], value[0])
@@ -335,6 +341,7 @@ def test_actions_of_all_kinds_are_taken(envs: ProcessVectorEnv, kind: Any) -> No
         (np.full((3, 26), -np.inf), "got NaN or infinity"),
         (np.full((3, 26), 1e300), "got NaN or infinity"),
         ([["left"] * 26] * 3, "got list .*expected numbers"),
+        (torch.zeros(3, 26, dtype=torch.complex64), "complex numbers"),
         (None, "actions: got"),
     ],
 )
@@ -351,8 +358,13 @@ def test_wrong_actions_are_refused_and_no_env_steps(
     ("kwargs", "message"),
     [
         ({"num_envs": 0}, "num_envs: got 0"),
-        ({"num_workers": 0}, "num_workers: got 0, expected at least 1"),
-        ({"num_workers": -1}, "num_workers: got -1, expected at least 1"),
+        ({"num_envs": True}, "num_envs: got True"),
+        ({"num_envs": "2"}, "num_envs: got '2', expected a whole number, at least 1"),
+        ({"num_workers": 0}, "num_workers: got 0, expected a whole number, at least 1"),
+        ({"num_workers": 1.5}, "num_workers: got 1.5"),
+        ({"timeout": 0}, "timeout: got 0, expected more than 0"),
+        ({"timeout": "long"}, "timeout: got 'long'"),
+        ({"task_id": None}, "task id: got None, expected a str"),
         ({"sim_backend": "gpus"}, "sim_backend: got 'gpus', expected 'auto' or one of"),
         ({"task_id": "NoSuchTask-v1"}, "available"),
     ],

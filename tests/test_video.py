@@ -116,7 +116,10 @@ def test_a_policy_without_pictures_has_its_numbers_in_their_place():
     assert heights[1] == heights[2] == heights[4] == 1
 
 
-@pytest.mark.parametrize("name, size", [("a.mp4", (1280, 720)), ("a.gif", (640, 360))])
+FILMS = [("a.mp4", (1280, 720)), ("B.MP4", (1280, 720)), ("a.gif", (640, 360))]
+
+
+@pytest.mark.parametrize("name, size", FILMS)
 def test_videos_play_and_hold_their_last_frame(name, size, tmp_path):
     path = tmp_path / "new" / name
     shots = [snapshot(step=step, right=[step]) for step in range(5)]
@@ -125,7 +128,7 @@ def test_videos_play_and_hold_their_last_frame(name, size, tmp_path):
     frames = [np.asarray(frame) for frame in reader]
     assert {(f.shape[1], f.shape[0]) for f in frames} == {size}
     # GIF merges equal frames into one that lasts longer.
-    assert len(frames) == (5 + 5 if name.endswith("mp4") else 5)
+    assert len(frames) == (5 if name.endswith("gif") else 5 + 5)
     assert not np.array_equal(frames[0], frames[4])
 
 
@@ -260,6 +263,18 @@ def test_learning_curve_draws_a_run(tmp_path):
     assert path == tmp_path / "learning_curve.png" and plain.shape[1] == 1200
     write_metrics(tmp_path, "evaluations.csv", [{"steps": 4096, "eval/success": 0.5}])
     assert not np.array_equal(imageio.imread(plots.learning_curve(tmp_path)), plain)
+
+
+@pytest.mark.parametrize("mark", ["\ufeff", ""])
+def test_a_curve_can_be_drawn_of_what_an_office_program_saved(tmp_path, mark):
+    rows = [{"steps": 2048 * i, "train/return": i / 4} for i in range(4)]
+    write_metrics(tmp_path, "metrics.csv", rows)
+    plain = imageio.imread(plots.learning_curve(tmp_path))
+    table = tmp_path / "metrics.csv"
+    text = mark + table.read_text().replace(",", ";").replace(".", ",")
+    table.write_text(text, encoding="utf-8")
+    drawn = plots.learning_curve(tmp_path, tmp_path / "B.PNG")
+    assert np.array_equal(imageio.imread(drawn), plain)
 
 
 def test_a_curve_leaves_out_a_row_that_a_kill_cut_short(tmp_path):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from reprlib import repr as short
 from typing import Any
 
@@ -35,6 +36,18 @@ def seeds_of(seed: int | Sequence[int], num_envs: int) -> list[int]:
         f"seed: got {short(given)}, expected an integer (env i gets seed + i) or "
         f"{num_envs} of them, so that each env's is from 0 to {SEEDS[-1]}"
     )
+
+
+def seed_of(seed: Any, num_envs: int) -> int | list[int] | None:
+    """Return what ManiSkill takes: one seed, from which it draws those of N envs, or N.
+
+    Raises:
+        ValueError: There are not N of them, or some are out of range or no integers.
+    """
+    given = _plain(seed)
+    if given is None or (_whole(given) and given in SEEDS):
+        return given
+    return seeds_of(given, num_envs)
 
 
 def instructions_of(
@@ -92,6 +105,7 @@ def options_of(
         ValueError: There is another option, or a value cannot be used.
     """
     require_names(options, RESET_OPTIONS)
+    require_reset(options)
     dealt = {
         name: _deal(name, value, experiment, num_envs)
         for name, value in options.items()
@@ -99,11 +113,67 @@ def options_of(
     return [{name: dealt[name][row] for name in dealt} for row in range(num_envs)]
 
 
-def require_names(options: Iterable[str], allowed: Sequence[str]) -> None:
+def require_names(options: Any, allowed: Sequence[str]) -> None:
     """Raise ValueError if there is an option that is not allowed."""
+    _require_dict(options)
     unknown = [name for name in options if name not in allowed]
     if unknown:
         raise ValueError(f"reset options: got {unknown}, expected some of {allowed}")
+
+
+def require_reset(options: Any) -> None:
+    """Raise ValueError if options are of the wrong kind or exclude each other.
+
+    Of names that are not known, which wrappers may have use for, it only warns.
+    """
+    _require_dict(options)
+    unknown = sorted(map(repr, options.keys() - {*RESET_OPTIONS, "env_idx"}))
+    if unknown:
+        known = ", ".join(RESET_OPTIONS)
+        text = f"reset options: {', '.join(unknown)} not known here, only {known}"
+        warnings.warn(text, stacklevel=3)
+    rebuilt = options.get("reconfigure", False)
+    if not isinstance(_plain(rebuilt), bool):
+        raise ValueError(
+            f"reset option 'reconfigure': got {short(rebuilt)}, expected True or False"
+        )
+    told, state = options.get("instruction"), options.get("reset_to_env_states")
+    if told is not None and state is not None:
+        raise ValueError(
+            f"reset options: got 'reset_to_env_states' and instruction {short(told)}, "
+            "expected one: a state has its instruction, which `tell` can change after"
+        )
+
+
+def _require_dict(options: Any) -> None:
+    if not isinstance(options, dict):
+        raise ValueError(f"reset options: got {short(options)}, expected a dict")
+
+
+def action_of(action: Any, shape: tuple[int, ...]) -> Tensor:
+    """Return an action of N envs, or of one, of any kind of numbers as float32.
+
+    Raises:
+        ValueError: It has another shape than [N, J], or [J] of one env, or is no
+            numbers.
+    """
+    if not isinstance(action, Tensor):  # a copy: strides may be negative
+        action = _numbers(np.array, action, shape)
+    given = _numbers(torch.as_tensor, action, shape).detach()
+    if given.is_complex():
+        raise ValueError(f"action: got complex numbers, expected real ones {shape}")
+    if given.shape != shape and (1, *given.shape) != shape:
+        raise ValueError(f"action: got shape {tuple(given.shape)}, expected {shape}")
+    return given.float()
+
+
+def _numbers(read: Callable[[Any], Any], given: Any, shape: tuple[int, ...]) -> Any:
+    """Return what `read` makes of an action; ValueError: nothing."""
+    try:
+        return read(given)
+    except (TypeError, ValueError, RuntimeError) as error:
+        got = f"{type(given).__name__} ({error})"
+        raise ValueError(f"action: got {got}, expected numbers {shape}") from None
 
 
 def actions_of(actions: Any, shape: tuple[int, ...] | None) -> np.ndarray:
@@ -114,9 +184,13 @@ def actions_of(actions: Any, shape: tuple[int, ...] | None) -> np.ndarray:
     """
     try:
         if isinstance(actions, Tensor):
-            actions = actions.detach().to("cpu", torch.float32).numpy()
+            kind = actions.dtype if actions.is_complex() else torch.float32
+            actions = actions.detach().to("cpu", kind).numpy()
         with np.errstate(over="ignore"):  # infinity, which is refused below
-            array = np.asarray(actions, dtype=np.float32)
+            array = np.asarray(actions)
+            if np.iscomplexobj(array):
+                raise TypeError("complex numbers")
+            array = array.astype(np.float32, copy=False)
     except (TypeError, ValueError, RuntimeError) as error:
         got = f"{type(actions).__name__} ({error})"
         raise ValueError(f"actions: got {got}, expected numbers {shape}") from None
@@ -129,13 +203,11 @@ def actions_of(actions: Any, shape: tuple[int, ...] | None) -> np.ndarray:
 
 def _deal(name: str, value: Any, experiment: Experiment, num_envs: int) -> list:
     """Return the value of an option for each of N envs."""
-    what = f"reset option {name!r}"
     if name == "instruction" and value is not None:
         return instructions_of(value, experiment, num_envs)
-    if name == "reconfigure" and not isinstance(_plain(value), bool):
-        raise ValueError(f"{what}: got {short(value)}, expected True or False")
     if name != "reset_to_env_states":
         return [value] * num_envs
+    what = f"reset option {name!r}"
     if not isinstance(value, dict) or "env_states" not in value:
         raise ValueError(f"{what}: got {short(value)}, expected {{'env_states': ...}}")
     return [_row(what, value, row, num_envs) for row in range(num_envs)]

@@ -142,8 +142,8 @@ class ProcessVectorEnv(VectorEnv):
             ValueError: A seed or an option cannot be used; no env has been reset.
             WorkerError: A worker failed (another reset may do), died or hangs.
         """
-        options = options or {}
-        if "env_idx" in options:
+        options = {} if options is None else options
+        if isinstance(options, dict) and "env_idx" in options:
             raise ValueError(
                 "reset options: got 'env_idx', expected none: worker processes reset "
                 "all envs at once, and each by itself when its episode ends"

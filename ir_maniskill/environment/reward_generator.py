@@ -7,7 +7,8 @@ Legend: N envs, F fingers, C objects, K reward terms.
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -125,7 +126,15 @@ class RewardWeights:
         for name, value in vars(self).items():
             most = 1 if name == "after_foul" else sys.float_info.max
             expected = "a finite number of at least 0 (after_foul: at most 1)"
-            require(0 <= value <= most, f"reward_weights.{name}", value, expected)
+            fits = isinstance(value, float | int) and 0 <= value <= most
+            require(fits, f"reward_weights.{name}", value, expected)
+
+    def changed(self, weights: Mapping[str, float]) -> RewardWeights:
+        """Return these with other values; ConfigError: there is no such weight."""
+        known = isinstance(weights, Mapping) and weights.keys() <= vars(self).keys()
+        expected = f"a dict of some of {', '.join(vars(self))}"
+        require(known, "reward_weights", weights, expected)
+        return replace(self, **weights)
 
     def vector(self) -> Tensor:
         """Return the weight of each of `TERMS`, penalties with their sign [K]."""

@@ -169,7 +169,8 @@ def require_askable(names: Iterable[str]) -> tuple[str, ...]:
     Raises:
         ValueError: There is no such term to ask for.
     """
-    if isinstance(names, str) or not set(names) <= set(askable()):
+    many = isinstance(names, Iterable) and not isinstance(names, str)
+    if not many or not set(names) <= set(askable()):
         raise ValueError(f"observe: got {names!r}, available: {askable()}")
     return tuple(names)
 

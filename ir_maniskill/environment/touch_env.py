@@ -6,7 +6,6 @@ Legend: N envs, b envs being reset, J joints, F fingers, C objects, L tokens.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -19,9 +18,15 @@ from mani_skill.utils.structs.types import SceneConfig, SimConfig
 from torch import Tensor
 
 from ir_maniskill import experiment as catalog
+from ir_maniskill.checks import require_whole
 from ir_maniskill.doctor import require_vulkan
 from ir_maniskill.environment import reward_generator, senses, table_scene
-from ir_maniskill.environment.arguments import instructions_of
+from ir_maniskill.environment.arguments import (
+    action_of,
+    instructions_of,
+    require_reset,
+    seed_of,
+)
 from ir_maniskill.environment.instructional_set import GoalBatch, InstructionalSet
 from ir_maniskill.environment.layout import layout_of
 from ir_maniskill.environment.rendering import RenderedEnv
@@ -109,7 +114,7 @@ class TouchEnv(RenderedEnv):
         robot_uids = find_robot(robot_uids)
         # ManiSkill warns of robots that are not in here; ours are not the only ones.
         self.SUPPORTED_ROBOTS = (*available_robots(), robot_uids)
-        self._reward_weights = replace(RewardWeights(), **(reward_weights or {}))
+        self._reward_weights = RewardWeights().changed(reward_weights or {})
         self.asked = senses.require_askable(observe)
         self._stepped = False  # whether a step was made that is not judged yet
         if render_backend == "auto":
@@ -293,12 +298,12 @@ class TouchEnv(RenderedEnv):
                 drawing them, as text or index, one for all envs or b of them.
 
         Raises:
-            ValueError: There is no such instruction, or there are not b.
+            ValueError: A seed or an option cannot be used.
             GoalError: A sentence refers to no object of its scene, or to several.
         """
-        options = dict(options or {})
-        if isinstance(seed, np.integer):
-            seed = int(seed)  # gymnasium and ManiSkill know no others
+        options = {} if options is None else options
+        require_reset(options)
+        options, seed = dict(options), seed_of(seed, self.num_envs)
         if seed is not None and not self._sim_device.is_cuda():
             options.setdefault("reconfigure", True)
         gym.Env.reset(self, seed=seed if isinstance(seed, int) else None)
@@ -310,10 +315,8 @@ class TouchEnv(RenderedEnv):
         Raises:
             ValueError: The action is not finite (checked on the CPU only).
         """
-        if isinstance(action, np.ndarray):  # ManiSkill's way takes much longer
-            action = torch.from_numpy(np.array(action))
-        if isinstance(action, Tensor):
-            action = action.detach().float()
+        if action is not None and not isinstance(action, dict):  # ManiSkill's matter
+            action = action_of(action, (self.num_envs, *self.single_action_space.shape))
             if not self._sim_device.is_cuda() and not action.isfinite().all():
                 raise ValueError(
                     f"action: got {action.tolist()}, expected finite numbers"
@@ -500,6 +503,7 @@ def _hands(robot: Robot) -> dict[str, list[bool]]:
 def _require_one_on_cpu(kwargs: dict[str, Any]) -> None:
     """Raise if several envs are asked for where physics can only be on the CPU."""
     count, backend = kwargs.get("num_envs", 1), str(kwargs.get("sim_backend", "auto"))
+    require_whole("num_envs", count, 1)
     on_cpu = not torch.cuda.is_available() or "cpu" in backend
     if count > 1 and on_cpu:
         raise ValueError(

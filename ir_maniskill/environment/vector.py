@@ -17,7 +17,7 @@ from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 from torch import Tensor
 
 from ir_maniskill import experiment as catalog
-from ir_maniskill.checks import require
+from ir_maniskill.checks import require, require_whole
 from ir_maniskill.environment.arguments import RESET_OPTIONS, require_names, seeds_of
 from ir_maniskill.environment.process_vector import ProcessVectorEnv, Step, final_infos
 
@@ -50,8 +50,11 @@ def make_vec(
         OSError: There is too little shared memory.
     """
     experiment = catalog.get(task_id)
-    for name, number in (("num_envs", num_envs), ("num_workers", num_workers)):
-        require(number is None or number >= 1, name, number, "at least 1")
+    require_whole("num_envs", num_envs, 1)
+    if num_workers is not None:
+        require_whole("num_workers", num_workers, 1)
+    waits = isinstance(timeout, float | int) and timeout > 0
+    require(waits, "timeout", timeout, "more than 0 [s]")
     if sim_backend == "auto":
         sim_backend = "physx_cuda" if torch.cuda.is_available() else "physx_cpu"
     if _simulator(sim_backend) == "physx_cuda":
@@ -91,8 +94,9 @@ class GpuVectorEnv(ManiSkillVectorEnv):
             ValueError: An option or a seed cannot be used, or a seed comes with
                 "env_idx": ManiSkill would start the other envs' random streams anew.
         """
-        options = dict(options or {})
+        options = {} if options is None else options
         require_names(options, (*RESET_OPTIONS, "env_idx"))
+        options = dict(options)
         if "env_idx" in options:
             if seed is not None:
                 raise ValueError(

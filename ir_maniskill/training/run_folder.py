@@ -92,14 +92,21 @@ class RunFolder:
         self._events = SummaryWriter(str(self.path), purge_step=steps + 1)
         self.write("config.json", (to_json(config) + "\n").encode())
         self._cut("metrics", steps)
-        return self._cut("evaluations", steps)
+        # Without the best policy the last evaluation is made again, to have one.
+        return self._cut("evaluations", steps - (not self.best.exists()))
 
     def _cut(self, name: str, steps: int) -> int:
         """Drop the rows after `steps` of a table; return the steps of the last kept."""
         table = self.path / f"{name}.csv"
         if not table.exists():
             return 0
-        rows = [row for row in whole_rows(table) if int(row["steps"]) <= steps]
+        try:
+            rows = [row for row in whole_rows(table) if int(row["steps"]) <= steps]
+        except (KeyError, ValueError) as error:
+            raise CheckpointError(
+                f"{table}: got {error}, expected a column `steps` of whole numbers; "
+                "mend it, or move it away"
+            ) from error
         self.write(table.name, _format(rows, header=True))
         return int(rows[-1]["steps"]) if rows else 0
 
@@ -161,9 +168,15 @@ def stored_config(folder: Path) -> TrainConfig | None:
 
 
 def whole_rows(table: Path) -> list[dict[str, str]]:
-    """Return the rows of a CSV table but those that were cut short."""
-    with table.open(newline="", errors="replace") as file:
+    """Return the rows of a CSV table but those that were cut short.
+
+    Office programs may have saved it, with a byte order mark, or with semicolons and
+    decimal commas.
+    """
+    with table.open(newline="", encoding="utf-8-sig", errors="replace") as file:
         lines = [line for line in file if line.endswith("\n")]
+    if lines and ";" in lines[0]:
+        lines = [line.replace(",", ".").replace(";", ",") for line in lines]
     rows = csv.DictReader(lines)
     return [row for row in rows if None not in row and None not in row.values()]
 

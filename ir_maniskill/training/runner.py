@@ -268,7 +268,9 @@ class Runner:
         try:
             self.algorithm.load_state_dict(stored.tensors)
             checkpoint.set_random_state(stored.tensors, stored.metadata["random"])
-            self.best_score = float(stored.metadata["best_score"])
+            if self.folder.best.exists():  # else the next evaluation's is the best
+                checkpoint.read(self.folder.best)  # better refused now than at the end
+                self.best_score = float(stored.metadata["best_score"])
             steps = stored.metadata["steps"]
             if type(steps) is not int or steps < 0:
                 raise ValueError(f"steps: got {steps!r}, expected a whole number")

@@ -44,8 +44,8 @@ class TargetController(PDJointPosController):
 
     @property
     def target(self) -> Tensor:
-        """Current joint position targets [N, J] [rad]."""
-        return self._target_qpos
+        """Current joint position targets [N, J] [rad]; before any, the positions."""
+        return self.qpos if self._target_qpos is None else self._target_qpos
 
     def set_action(self, action: Tensor) -> None:
         """Set the targets, or change them if the config says `use_delta`.
