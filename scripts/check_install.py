@@ -26,6 +26,8 @@ def main() -> None:
 
 def check_origin(prefix: Path) -> None:
     """Check that modules and data files lie under the prefix, none in a checkout."""
+    from ir_maniskill.language.lexicon import lexicon
+
     for name, module in sorted(sys.modules.items()):
         if name.partition(".")[0] != "ir_maniskill" or not module.__file__:
             continue
@@ -36,6 +38,8 @@ def check_origin(prefix: Path) -> None:
     assert urdf.is_file() and urdf.resolve().is_relative_to(prefix), urdf
     meshes = [path for path in urdf.parent.rglob("*.glb")]
     assert meshes, f"no meshes beside {urdf}"
+    shares = lexicon(("<pad>", "<unk>", "red", "blue")).read("crimson")
+    assert next(iter(shares), None) == "red", shares
 
 
 def check_step(env: gym.Env) -> None:

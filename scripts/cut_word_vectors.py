@@ -26,7 +26,7 @@ from ir_maniskill.language.lexicon import ENDINGS, function_words
 OUT = Path(__file__).parent.parent / "assets" / "language"
 COMMON = 30_000
 """How many words are kept, beside those of the language and of colors."""
-SENSES = 5
+SENSES = 2
 """Senses of a word that count: WordNet lists the most common first."""
 PULL = 2.0
 """How far words move toward the words of the language that WordNet links them to."""

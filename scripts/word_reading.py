@@ -1,4 +1,4 @@
-"""Prints the tables of docs/language.md: how held-out wording is read, word by word.
+"""Writes tables into docs/language.md: how held-out wording is read, word by word.
 
 No policy acts here. A word is read right if the known word that it is most of all read
 as means the same in the grammar. A sentence is read right if the colors (shapes, verbs)
@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from itertools import product
+from pathlib import Path
 from random import Random
 
 from ir_maniskill.goals import (
@@ -26,6 +27,9 @@ from ir_maniskill.language import KINDS, Thing, draw, handwritten, say, words
 from ir_maniskill.language.grammar import RULES
 from ir_maniskill.language.lexicon import lexicon
 from ir_maniskill.language.tokens import split_words
+
+PAGE = Path(__file__).parent.parent / "docs" / "language.md"
+BEGIN, END = "<!-- begin reading -->\n", "\n<!-- end reading -->"
 
 SYMBOLS = {
     "color": ("color",),
@@ -146,4 +150,5 @@ def tables() -> str:
 
 
 if __name__ == "__main__":
-    print(tables())
+    before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
+    PAGE.write_text(before + BEGIN + tables() + END + rest.split(END)[1], "utf-8")

@@ -27,7 +27,7 @@ NEIGHBORS = 3
 """How many known words an unknown one is a mixture of, at most."""
 CROWD = 100
 """How many words tell how near a known word is to anything at all."""
-THRESHOLD = 0.3
+THRESHOLD = 0.4
 """How near a word must be to be read as another."""
 TEMPERATURE = 0.03
 """Of the softmax that mixes."""
@@ -63,8 +63,8 @@ class Lexicon:
             return next((self._ids[known] for known in shares), UNK)
         if word not in self._rows:
             self._rows[word] = len(self.mixtures)
-            row = np.float32([[shares.get(known, 0) for known in self.vocabulary]])
-            self.mixtures = np.concatenate([self.mixtures, row])
+            row = np.array([shares.get(w, 0) for w in self.vocabulary], np.float32)
+            self.mixtures = np.concatenate([self.mixtures, row[None]])
         return len(self.vocabulary) + self._rows[word]
 
     def _unknown(self, word: str) -> Mapping[str, float]:
@@ -155,7 +155,8 @@ def edit_distance(a: str, b: str) -> int:
 
     Optimal string alignment, one row of the table after the other.
     """
-    before, row = [], list(range(len(b) + 1))
+    before: list[int] = []
+    row = list(range(len(b) + 1))
     for i, x in enumerate(a):
         above, row = row, [i + 1]
         for j, y in enumerate(b):
