@@ -5,9 +5,12 @@
 
 ManiSkill's `CPUGymWrapper` makes a plain Gymnasium env of numpy arrays of it; `make`
 lays its nested observation out flat, which is what `MultiInputPolicy` reads. It makes
-the tokens of the sentence one-hot, since their space is `MultiDiscrete`.
+the tokens of the sentence one-hot, since their space is `MultiDiscrete`. Afterwards:
+
+    ir-maniskill audit NaoTouchCubeSingle-v1 --policy examples.sb3_ppo:policy
 """
 
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,27 +24,27 @@ from stable_baselines3 import PPO
 
 import ir_maniskill  # noqa: F401 - registers the tasks
 
+OUT = Path("runs/sb3_ppo.zip")
+KWARGS: dict[str, Any] = {
+    "obs_mode": "rgb",
+    "reward_mode": "dense",
+    "control_mode": "pd_joint_target_delta_pos",
+    "sensor_configs": {"width": 36, "height": 72, "shader_pack": "unlit"},
+}
+"""Its vision net takes no pictures that are less than 36 wide."""
+
 
 def flatten(obs: dict[str, Any]) -> dict[str, np.ndarray]:
     """Return the observation as one dict of arrays."""
     felt = [*obs["agent"].values(), obs["extra"]["touch"]]
     pictures = {name: data["rgb"] for name, data in obs["sensor_data"].items()}
     words = obs["extra"]["instruction"]
-    return {**pictures, "body": np.concatenate(felt), "instruction": words}
+    return {**pictures, "body": np.concatenate(felt, axis=-1), "instruction": words}
 
 
 def make(task: str, **env_kwargs: Any) -> gym.Env:
-    """Make one env of a task as Stable-Baselines3 takes it; pictures of 72 x 36.
-
-    Its vision net takes none that are less than 36 wide.
-    """
-    kwargs: dict[str, Any] = {
-        "obs_mode": "rgb",
-        "reward_mode": "dense",
-        "control_mode": "pd_joint_target_delta_pos",
-        "sensor_configs": {"width": 36, "height": 72, "shader_pack": "unlit"},
-    }
-    env = CPUGymWrapper(gym.make(task, **kwargs | env_kwargs))
+    """Make one env of a task as Stable-Baselines3 takes it."""
+    env = CPUGymWrapper(gym.make(task, **KWARGS | env_kwargs))
     obs, _ = env.reset(seed=0)
     spaces: dict[str, gym.Space] = {
         name: Box(0, 255, leaf.shape, np.uint8)
@@ -54,12 +57,27 @@ def make(task: str, **env_kwargs: Any) -> gym.Env:
     return TransformObservation(env, flatten, Dict(spaces))
 
 
+def policy(obs: dict[str, Any]) -> np.ndarray:
+    """Return the actions of the trained model for what a vector env observes."""
+    rows = {name: np.asarray(leaf) for name, leaf in flatten(obs).items()}
+    return trained().predict(rows, deterministic=True)[0]
+
+
+policy.env_kwargs = KWARGS  # type: ignore[attr-defined]
+
+
+@cache
+def trained() -> PPO:
+    """Return the trained model."""
+    return PPO.load(OUT)
+
+
 def main(
     task: str = "NaoTouchCubeSingle-v1",
     steps: int = 20_000,
     rollout: int = 1024,
     episodes: int = 20,
-    out: Path = Path("runs/sb3_ppo.zip"),
+    out: Path = OUT,
 ) -> None:
     """Train, save the policy, and count what it touches."""
     env = make(task)

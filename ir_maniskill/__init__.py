@@ -6,6 +6,7 @@ Importing this package registers the robots and every task id, and does nothing 
     load_policy    a trained policy: `act(obs)`
     train          learn a task
     evaluate       play seeded episodes, and count
+    audit          ask whether a policy looks and reads
     record         film a policy
     Experiment     what a task is; `register` makes one known to `gym.make`
     Goal           what a sentence asks for: `Touch`, `Push`, ... or a verb of your own
@@ -20,7 +21,7 @@ if "torch" not in sys.modules:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import ir_maniskill.tasks  # noqa: F401 - registers the tasks
-from ir_maniskill.api import evaluate, record
+from ir_maniskill.api import audit, evaluate, record
 from ir_maniskill.environment.vector import make_vec
 from ir_maniskill.experiment import (
     Experiment,
@@ -47,6 +48,7 @@ __all__ = [
     "Then",
     "Touch",
     "TouchObject",
+    "audit",
     "available",
     "evaluate",
     "load_policy",

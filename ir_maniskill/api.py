@@ -1,21 +1,28 @@
-"""What to do with a trained policy, in one call each: evaluate it, film it."""
+"""What to do with a trained policy, in one call each: evaluate, audit, film it."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+import torch
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.checks import require, require_whole
 from ir_maniskill.environment.arguments import SEEDS
 from ir_maniskill.environment.vector import make_vec
+from ir_maniskill.evaluation import audit as audits
 from ir_maniskill.evaluation import video
 from ir_maniskill.evaluation.evaluate import (
     EVALUATION_SEED,
     EvaluationReport,
+    Player,
     choose_instructions,
     evaluate_policy,
+    player_of,
 )
 from ir_maniskill.experiment import Experiment
 from ir_maniskill.files import require_writable
@@ -76,6 +83,63 @@ def evaluate(
             instructions=chosen,
             progress=progress,
         )
+
+
+def audit(
+    policy: PolicyLike | Callable[[Any], Any],
+    task: str | None = None,
+    *,
+    episodes: int = 200,
+    seed: int = EVALUATION_SEED,
+    num_envs: int = 8,
+    any_task: bool = False,
+    progress: bool = True,
+    **env_kwargs: Any,
+) -> audits.AuditReport:
+    """Ask whether a policy looks, reads and copes with what is new to it.
+
+    What it takes and raises is what `evaluate` does, and: `policy` may be any function
+    from what a vector env observes to actions [N, J] in [-1, 1], or have such a method
+    `act` and, if it remembers anything, `reset(done)`. What it has as `env_kwargs` goes
+    to `make_vec`; without, it sees pictures and its actions change the joints' targets.
+    `episodes` are those of each row, and `num_envs` at least 2.
+
+    Returns:
+        The table: `print` shows it, `evaluation.plots.bars` draws it.
+    """
+    require(num_envs >= 2, "num_envs", num_envs, "at least 2")
+    if isinstance(policy, Policy | str | Path):
+        policy, experiment, _ = _prepare(policy, task, any_task, episodes, seed, None)
+        player = player_of(policy.agent.policy, policy.config.frames)
+        kwargs = policy.env_kwargs
+    else:
+        experiment = catalog.get(task or "")
+        player = _player(policy)
+        kwargs = PICTURES | getattr(policy, "env_kwargs", {})
+    return audits.audit(
+        player,
+        experiment,
+        partial(make_vec, experiment.id, num_envs, **{**kwargs, **env_kwargs}),
+        episodes=episodes,
+        seed=seed,
+        progress=progress,
+    )
+
+
+PICTURES = {"obs_mode": "rgb", "control_mode": "pd_joint_target_delta_pos"}
+"""How envs are made for a policy that says nothing of it."""
+
+
+def _player(policy: Any) -> Player:
+    """Return somebody else's policy as one that is told where episodes begin."""
+    act, reset = getattr(policy, "act", policy), getattr(policy, "reset", None)
+
+    def player(obs: Any, done: Any) -> Any:
+        if reset is not None:
+            reset(done)
+        return torch.as_tensor(act(obs))
+
+    return player
 
 
 def record(

@@ -6,6 +6,8 @@ import argparse
 import dataclasses
 import io
 import logging
+import os
+import pkgutil
 import shlex
 import signal
 import sys
@@ -165,6 +167,61 @@ class Evaluate(_Play):
 
 
 @dataclasses.dataclass(frozen=True)
+class Audit:
+    """Ask whether a policy looks, reads, and copes with what is new to it."""
+
+    env_id: TaskId
+    """Task, e.g. NaoTouchCubeShuffled-v1; MODULE is imported first."""
+    checkpoint: Path | None = None
+    """Policy or checkpoint file; None: the one that ships with the package."""
+    policy: str | None = None
+    """MODULE:FUNCTION from what a vector env observes to actions, to audit instead."""
+    any_task: bool = False
+    """Accept a policy that was trained for another task."""
+    seed: int = EVALUATION_SEED
+    """Seed of the first episode; episode e starts from seed + e."""
+    episodes: int = 200
+    """Episodes of each row of the table."""
+    num_envs: int = 8
+    """Scenes simulated side by side."""
+    json: Path | None = None
+    """File to write the table to."""
+    picture: Path | None = None
+    """File to draw it to (.png)."""
+
+    def run(self) -> None:
+        """Print the table, write and draw it."""
+        for path in (self.json, self.picture):
+            if path is not None:
+                require_writable(path)
+        policy = _function(self.policy) if self.policy else self._file()
+        names = ("any_task", "seed", "episodes", "num_envs")
+        options = {name: getattr(self, name) for name in names}
+        report = api.audit(policy, catalog.get(self.env_id).id, **options)
+        print(report)
+        if self.json is not None:
+            origin = self.policy or str(self.checkpoint or report.env_id)
+            write_report(self.json, report, policy=origin)
+        if self.picture is not None:
+            plots.bars(report, self.picture)
+
+    def _file(self) -> Path:
+        return _Play(self.env_id, self.checkpoint).policy_file()
+
+
+def _function(name: str) -> Any:
+    """Return what "MODULE:FUNCTION" names."""
+    sys.path.append(os.getcwd())
+    try:
+        return pkgutil.resolve_name(name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise UsageError(
+            f"--policy: got {name!r}, expected MODULE:FUNCTION that can be imported "
+            f"({error})"
+        ) from error
+
+
+@dataclasses.dataclass(frozen=True)
 class Video(_Play):
     """Make a video of a policy (.mp4, or .gif)."""
 
@@ -299,6 +356,7 @@ def _parse(arguments: Sequence[str], defaults: TrainConfig) -> Any:
         Tasks
         | Annotated[Train, subcommand("train", default=default)]
         | Evaluate
+        | Audit
         | Video
         | Curve
         | Bench

@@ -15,11 +15,12 @@ from typing import Any
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.vector import make_vec
+from ir_maniskill.evaluation.audit import same_scene
 from ir_maniskill.evaluation.evaluate import (
     EVALUATION_SEED,
     EvaluationReport,
     evaluate_policy,
-    evaluate_scenes,
+    player_of,
 )
 from ir_maniskill.files import write_json
 from ir_maniskill.training import checkpoint
@@ -45,8 +46,10 @@ def ship(run: Path, episodes: int, scenes: int) -> EvaluationReport:
         report = evaluate_policy(agent.policy, envs, episodes=told, **play)
         figures = {**report.as_dict(), "commit": _commit()}
         if sentences > 1:
-            same = evaluate_scenes(agent.policy, envs, scenes=scenes, **play)
-            figures["same_scene"] = {"scenes": scenes, **same.as_dict("exclusive")}
+            player = player_of(agent.policy, config.frames)
+            same = same_scene(player, envs, scenes=scenes, seed=EVALUATION_SEED)[0]
+            exclusive = same.exclusive.as_dict("exclusive")
+            figures["same_scene"] = {"scenes": scenes, **exclusive}
     # Only now: what shipped before stays until the new figures are there.
     path = FOLDER / f"{task}.safetensors"
     path.parent.mkdir(exist_ok=True)

@@ -9,7 +9,8 @@ import torch
 
 import ir_maniskill
 from ir_maniskill.evaluation import evaluate
-from ir_maniskill.evaluation.evaluate import Rate, evaluate_policy, evaluate_scenes
+from ir_maniskill.evaluation.audit import same_scene
+from ir_maniskill.evaluation.evaluate import Rate, evaluate_policy, player_of
 
 STEPS = 4
 SENTENCES = ("Touch the blue cube.", "Touch the red cube.")
@@ -29,7 +30,7 @@ class ScriptedEnvs:
         self.num_envs, self.resets, self.closed = num_envs, [], False
 
     def reset(self, *, seed=None, options=None):
-        self.seed = torch.arange(seed, seed + self.num_envs)
+        self.seed = torch.tensor(seed)
         self.told = torch.tensor(options["instruction"])
         self.resets.append((seed, self.told.tolist()))
         self.t = 0
@@ -136,14 +137,16 @@ def test_scores_do_not_depend_on_the_number_of_envs(num_envs):
 
 def test_episodes_have_pinned_seeds_and_instructions_in_turn():
     _, envs = scripted(num_envs=4, episodes=6)
-    assert envs.resets == [(0, [0, 1, 0, 1]), (4, [0, 1, 0, 1])]
+    assert envs.resets[0] == ([0, 1, 2, 3], [0, 1, 0, 1])
+    # Two are left; the other envs play the first episodes again, uncounted.
+    assert envs.resets[1] == ([4, 5, 0, 1], [0, 1, 0, 1])
 
 
 def test_envs_that_are_given_stay_open_and_name_the_task():
     envs = ScriptedEnvs(2)
     report = evaluate_policy(still, envs, episodes=2, seed=0)
     assert report.env_id == "Scripted-v1"
-    evaluate_scenes(still, envs, scenes=2, seed=0)
+    same_scene(player_of(still, 3), envs, scenes=2, seed=0)
     assert not envs.closed
 
 
@@ -211,22 +214,26 @@ class ObedientEnvs(ScriptedEnvs):
         return obs, reward, terminated, done, info
 
 
+def exclusive_in_scenes(envs, scenes, seed):
+    rows = same_scene(player_of(still, 3), envs, scenes=scenes, seed=seed)
+    return [row.exclusive for row in rows]
+
+
 @pytest.mark.parametrize("num_envs", [1, 4, 9])
 def test_a_scene_counts_if_every_sentence_is_obeyed_in_it(num_envs):
     envs = ObedientEnvs(num_envs)
-    # Of the seeds 0 to 8 the even ones 2, 4 and 8 are no multiples of 3.
-    assert evaluate_scenes(still, envs, scenes=9, seed=0) == Rate(3, 9)
-    told = {seed: [t for s, t in envs.resets if s == seed] for seed, _ in envs.resets}
-    for each in told.values():
-        assert each == [[0] * num_envs, [1] * num_envs]
+    # Of the seeds 0 to 8 the even ones 2, 4 and 8 are no multiples of 3: both obeyed.
+    # Blue is obeyed in 0, 2, 4, 6, 8 and red in 1, 2, 4, 5, 7, 8.
+    assert exclusive_in_scenes(envs, 9, 0) == [Rate(3, 9), Rate(11, 18)]
+    played = {pair for reset in envs.resets for pair in zip(*reset, strict=True)}
+    assert played == {(seed, told) for seed in range(9) for told in (0, 1)}
 
 
 def test_scenes_are_counted_one_by_one_and_not_on_average():
-    envs = ObedientEnvs(2)
     # Seed 2 obeys both; seed 3 is odd and a multiple of 3 and obeys neither.
-    assert evaluate_scenes(still, envs, scenes=2, seed=2) == Rate(1, 2)
+    assert exclusive_in_scenes(ObedientEnvs(2), 2, 2) == [Rate(1, 2), Rate(2, 4)]
     with pytest.raises(ValueError, match="scenes: got 0, expected at least 1"):
-        evaluate_scenes(still, envs, scenes=0, seed=2)
+        exclusive_in_scenes(ObedientEnvs(2), 0, 2)
 
 
 def test_a_seeds_scene_is_the_same_whatever_is_told():

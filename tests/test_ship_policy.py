@@ -9,6 +9,7 @@ import ship_policy
 from toy_envs import SPEC, toy_config, toy_state
 
 from ir_maniskill.agent import Agent
+from ir_maniskill.evaluation.audit import Row
 from ir_maniskill.evaluation.evaluate import Rate
 from ir_maniskill.training import checkpoint
 
@@ -24,7 +25,8 @@ def fake_report(policy, envs, *, episodes, **_):
 
 
 def fake_scenes(policy, envs, *, scenes, **_):
-    return Rate(scenes - 1, scenes)
+    rate = Rate(scenes - 1, scenes)
+    return [Row("same scene", "every sentence", rate, rate)]
 
 
 @pytest.fixture(autouse=True)
@@ -63,7 +65,7 @@ def test_a_shipped_policy_has_its_figures_and_origin(tmp_path, monkeypatch, sent
     monkeypatch.setattr(ship_policy, "FOLDER", tmp_path / "policies")
     monkeypatch.setattr(ship_policy, "_commit", lambda: "0" * 40)
     monkeypatch.setattr(ship_policy, "evaluate_policy", fake_report)
-    monkeypatch.setattr(ship_policy, "evaluate_scenes", fake_scenes)
+    monkeypatch.setattr(ship_policy, "same_scene", fake_scenes)
     run = make_run(tmp_path / "run5", TASK[sentences])
     ship_policy.ship(run, episodes=20, scenes=10)
     stem = tmp_path / "policies" / TASK[sentences]

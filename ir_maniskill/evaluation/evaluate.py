@@ -22,9 +22,8 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from ir_maniskill.checks import require
 from ir_maniskill.environment.arguments import instructions_of
-from ir_maniskill.environment.senses import State, StateStack
+from ir_maniskill.environment.senses import Observation, State, StateStack
 from ir_maniskill.environment.vector import VectorEnv, info_of_step
 from ir_maniskill.experiment import Experiment
 from ir_maniskill.files import write_json
@@ -32,6 +31,10 @@ from ir_maniskill.language import KINDS, kind_of
 
 Policy = Callable[[State], Tensor]
 """Maps the state s_t of N envs to their actions [N, 26] in [-1, 1]."""
+
+Player = Callable[[Observation, Tensor | None], Tensor]
+"""Maps what N envs observe to their actions, and keeps what it must remember: `done`
+[N] bool says in which envs an episode begins; None: in all."""
 
 EVALUATION_SEED = 2_000_000
 """Seed of the first episode that figures are made of, apart from those of training and
@@ -189,64 +192,51 @@ def evaluate_policy(
             "one for each instruction"
         )
     told = [chosen[e % len(chosen)] for e in range(episodes)]
-    figures, names = _play(policy, envs, told, seed, StateStack(frames), progress)
-    groups = {name: [n == name for n in names] for name in _order(names)}
+    seeds = range(seed, seed + episodes)
+    player = player_of(policy, frames)
+    figures, names = play(player, envs, told, seeds, progress)
     return EvaluationReport(
         env_id=envs.experiment.id,
         seed=seed,
         episodes=episodes,
-        instructions={n: _score(figures[torch.tensor(g)]) for n, g in groups.items()},
-        overall=_score(figures),
+        instructions=score_by_name(figures, names),
+        overall=score(figures),
     )
 
 
-def _order(names: Sequence[str]) -> list[str]:
-    """Return the different names: kinds in their order, sentences as they came."""
-    return sorted(
-        dict.fromkeys(names), key=lambda n: KINDS.index(n) if n in KINDS else 0
-    )
+def player_of(policy: Policy, frames: int) -> Player:
+    """Return a policy as one that gets observations, of which it stacks S.
 
-
-def evaluate_scenes(
-    policy: Policy,
-    envs: VectorEnv,
-    *,
-    scenes: int,
-    seed: int,
-    frames: int = 3,
-    progress: bool = False,
-) -> Rate:
-    """Return in how many scenes every sentence is obeyed, without a foul.
-
-    A policy that neither looks nor reads may have every single score by chance or by
-    habit; only one that does both obeys all sentences in a shuffled scene.
-
-    Args:
-        policy: Acts without noise on the state s_t.
-        envs: The task, in as many envs as play at a time. They are left open.
-        scenes: How many; each is played once for every sentence.
-        seed: Seed of the first scene; scene e has seed + e.
-        frames: S, observations stacked into a state.
-        progress: Whether to show a progress bar.
-
-    Raises:
-        ValueError: No scenes.
+    On the CPU it acts on one env after another. How a matrix product is rounded depends
+    on the number of rows, and contacts make much of little: alone, an env is acted on
+    alike whatever others are beside it.
     """
-    require(scenes >= 1, "scenes", scenes, "at least 1")
-    obeyed = torch.ones(scenes, dtype=torch.bool)
-    for index in range(len(envs.experiment.sentences)):
-        told = [index] * scenes
-        figures, _ = _play(policy, envs, told, seed, StateStack(frames), progress)
-        obeyed &= figures[:, FIGURES.index("exclusive")] > 0
-    return Rate(int(obeyed.sum()), scenes)
+    stack = StateStack(frames)
+
+    def player(obs: Observation, done: Tensor | None) -> Tensor:
+        state = stack.reset(obs) if done is None else stack.push(obs, done)
+        count, device = len(state["instruction"]), state["instruction"].device
+        if device.type != "cpu":
+            return policy(state)
+        rows = [{k: v[i : i + 1] for k, v in state.items()} for i in range(count)]
+        return torch.cat([policy(row) for row in rows]).to(device)
+
+    return player
 
 
-def write_report(path: Path, report: EvaluationReport, **facts: Any) -> None:
+def score_by_name(figures: Tensor, names: Sequence[str]) -> dict[str, Score]:
+    """Return the score of each name's episodes: kinds in their order, else as met."""
+    order = sorted(set(names), key=lambda n: [*KINDS, *names].index(n))
+    groups = {name: torch.tensor([n == name for n in names]) for name in order}
+    return {name: score(figures[rows]) for name, rows in groups.items()}
+
+
+def write_report(path: Path, report: Any, **facts: Any) -> None:
     """Write the report as JSON, with the versions and the machine it was made on.
 
     Args:
         path: The file.
-        report: What was measured.
+        report: What was measured: its `as_dict()` is plain data.
         **facts: More to write down: the checkpoint, the configuration, ...
     """
     made = {"versions": versions(), "machine": machine()}
@@ -319,15 +309,21 @@ def threads(count: int) -> Iterator[None]:
 
 @threads(1)  # the cores are the simulator's: one row of a policy is too little to share
 @torch.no_grad()  # envs may keep what they get, and write to it later
-def _play(
-    policy: Policy,
+def play(
+    player: Player,
     envs: VectorEnv,
-    told: Sequence[int | str | None],  # [E]
-    seed: int,
-    stack: StateStack,
-    progress: bool,
+    told: Sequence[Any],
+    seeds: Sequence[int],
+    progress: bool = False,
 ) -> tuple[Tensor, list[str]]:
-    """Play all episodes, N at a time; episode e is told told[e], None: what is drawn.
+    """Play all E episodes, N at a time.
+
+    Args:
+        player: Acts.
+        envs: The task.
+        told: What each episode is told, as a reset takes it; None: what is drawn [E].
+        seeds: Where each starts from [E].
+        progress: Whether to show a progress bar.
 
     Returns:
         `FIGURES` of each episode [E, 7] float64, and the sentence or its kind [E].
@@ -338,29 +334,28 @@ def _play(
     firsts = range(0, episodes, n)
     for first in tqdm(firsts, "evaluate", disable=not progress, leave=False):
         episode = torch.arange(first, first + n)  # [N]
-        say = [told[e % episodes] for e in episode.tolist()]
+        rows = [e % episodes for e in episode.tolist()]  # the last may be to spare
+        say = [told[row] for row in rows]
         options = {} if say[0] is None else {"instruction": say}
-        obs, _ = envs.reset(seed=seed + first, options=options)
+        obs, _ = envs.reset(seed=[seeds[row] for row in rows], options=options)
         names += _names(envs, say)
-        state = stack.reset(obs)
-        playing = episode < episodes  # the last round may have envs to spare
+        playing, done = episode < episodes, None
         while playing.any():
-            action = _act(policy, state, envs.device)
+            action = player(obs, done)
             obs, reward, terminated, truncated, info = envs.step(action)
             done = terminated | truncated
             step = _measured(reward, info_of_step(info, done))[playing]
             figures[episode[playing], :2] = step[:, :2]
             figures[episode[playing], 2:] += step[:, 2:]
             playing &= ~done.cpu()
-            state = stack.push(obs, done)
     return figures, names[:episodes]
 
 
-def _names(envs: VectorEnv, told: Sequence[int | str | None]) -> list[str]:
+def _names(envs: VectorEnv, told: Sequence[Any]) -> list[str]:
     """Return the sentence of each env; where they are spoken, its kind."""
     sentences = envs.experiment.sentences
     if sentences:
-        return [sentences[index] for index in told if isinstance(index, int)]
+        return [sentences[index] for index in told]
     each = envs.get_attr("instructions")  # of N envs, or of N vectors of one
     said = [i for one in each for i in (one if isinstance(one, list) else [one])]
     return [kind_of(instruction.goal) for instruction in said]
@@ -374,7 +369,7 @@ def _measured(reward: Tensor, info: dict[str, Tensor]) -> Tensor:
     return torch.stack([column.cpu().double() for column in columns], dim=1)
 
 
-def _score(figures: Tensor) -> Score:
+def score(figures: Tensor) -> Score:
     """Return the score of episodes, of which `FIGURES` are given [E, 7]."""
     total = len(figures)
     success, exclusive, steps, *sums, returns = figures.sum(dim=0).tolist()
@@ -387,16 +382,3 @@ def _score(figures: Tensor) -> Score:
         wrong_fingers=wrong,
         mean_return=returns / total,
     )
-
-
-def _act(policy: Policy, state: State, device: torch.device) -> Tensor:
-    """Return the actions [N, 26], on the CPU computed for one env after another.
-
-    How a matrix product is rounded depends on the number of rows, and contacts make
-    much of little: alone, an env is acted on alike whatever others are beside it.
-    """
-    n = len(state["instruction"])
-    if device.type != "cpu":
-        return policy(state)
-    rows = [policy({k: v[i : i + 1] for k, v in state.items()}) for i in range(n)]
-    return torch.cat(rows).to(device)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import cycle
+from itertools import cycle, groupby
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ir_maniskill.evaluation.audit import AuditReport
 from ir_maniskill.files import replacing
 from ir_maniskill.training.run_folder import whole_rows
 
@@ -164,6 +165,45 @@ def _draw_range(
     axes.fill_between(steps[common], low, high, color=color, alpha=0.18, linewidth=0)
     if len(values) > 1:
         axes.plot(steps, values.T, color=color, linewidth=0.7, alpha=0.6)
+
+
+def bars(report: AuditReport, out: Path) -> Path:
+    """Draw an audit: success pale, exclusive success dark, the intervals of that.
+
+    Args:
+        report: The table.
+        out: Picture to write.
+
+    Returns:
+        The picture's file.
+    """
+    rows = report.rows
+    figure = Figure((8.0, 0.9 + 0.24 * len(rows)), dpi=150, layout="constrained")
+    axes = figure.subplots()
+    groups = [name for name, _ in groupby(rows, lambda row: row.group)]
+    at = [-i - 0.7 * groups.index(row.group) for i, row in enumerate(rows)]
+    for name, color, height in (
+        ("success", "#c6d8f7", 0.8),
+        ("exclusive", "#2f6fde", 0.4),
+    ):
+        rates = [getattr(row, name) for row in rows]
+        share = np.array([rate.value for rate in rates])
+        low, high = np.array([rate.interval for rate in rates]).T
+        error = 100 * np.clip([share - low, high - share], 0, None)
+        axes.barh(at, 100 * share, height, color=color, label=name)
+        if name == "exclusive":
+            axes.errorbar(100 * share, at, xerr=error, fmt="none", ecolor=INK, lw=0.9)
+    axes.set_yticks(at, [row.name for row in rows], fontsize=8, color=INK)
+    axes.set(xlim=(0, 101), xlabel="Episodes, 95% interval of exclusive success [%]")
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    axes.tick_params(colors=INK, length=0)
+    axes.grid(axis="x", color="#e7eaef", linewidth=0.8)
+    axes.set_axisbelow(True)
+    figure.suptitle(f"{report.env_id}, {report.episodes} episodes a row", color=INK)
+    figure.legend(
+        loc="outside lower center", ncols=2, frameon=False, labelcolor=INK, fontsize=8
+    )
+    return _save(figure, out)
 
 
 def _read(table: Path) -> list[Row]:

@@ -56,6 +56,11 @@ class TargetController(PDJointPosController):
         angle = self._preprocess_action(action)
         self.set_drive_targets(self.target + angle if self.config.use_delta else angle)
 
+    def action_for(self, targets: Tensor) -> Tensor:
+        """Return the action, as far as it goes, that sets these targets [N, J]."""
+        angle = targets - self.target if self.config.use_delta else targets
+        return ((angle - self._action_middle) / self._action_scale).clamp(-1, 1)
+
     def set_drive_targets(self, targets: Tensor) -> None:
         """Send targets to the simulator.
 
