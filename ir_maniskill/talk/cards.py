@@ -19,7 +19,8 @@ FAINT = "color:#8b93a1;font-size:0.75rem"
 def sentence_card(reading: Reading, score: Score) -> str:
     """Return what the robot is told, how that was understood, and what came of it."""
     rows = [f'<div style="font-size:1.15rem;font-weight:600">{_mark(reading)}</div>']
-    rows.append(_row("means", escape(reading.meaning)))
+    title = "means" if reading.goal else "not understood:"
+    rows.append(_row(title, escape(reading.meaning)))
     if reading.said != reading.heard:
         rows.append(_row("the policy hears", escape(reading.said)))
     if reading.unknown:

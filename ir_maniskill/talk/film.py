@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from ir_maniskill.environment.touch_env import CONTROL_FREQ
 from ir_maniskill.evaluation import video
@@ -29,6 +30,8 @@ class Moment:
     """What was played."""
     state: dict[str, Any]
     """The simulator's state."""
+    slot: Tensor
+    """Which body is in each slot of the table [1, C]."""
     pictures: dict[str, np.ndarray]
     """What the policy's cameras saw."""
     sentence: str
@@ -54,9 +57,12 @@ class Film:
     def add(self, session: Session) -> None:
         """Keep the step that was just made."""
         lights = session.lights().values()
+        state = session.env.get_state_dict()
+        del state["task"]  # a film is not judged
         moment = Moment(
             session.choice,
-            session.env.get_state_dict(),
+            state,
+            session.env.table.slot,
             {name: seen.copy() for name, seen in session.pictures().items()},
             session.reading.heard,
             tuple(state for hand in lights for state in hand.values()),
@@ -99,6 +105,7 @@ class Film:
 def _shots(take: list[Moment], stage: Any, hands: Any) -> Iterator[video.Snapshot]:
     history: tuple[tuple[bool, bool], ...] = ()
     for moment in take:
+        stage.unwrapped.table.put(slice(None), moment.slot)
         stage.unwrapped.set_state_dict(moment.state)
         history += ((moment.success, "wrong" in moment.lights),)
         yield video.Snapshot(

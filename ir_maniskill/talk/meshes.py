@@ -37,14 +37,19 @@ def _meshes(shape: sapien.render.RenderShape) -> list[trimesh.Trimesh]:
     return [mesh.apply_transform(frame) for mesh in found if len(mesh.faces)]
 
 
-def _mesh(part: sapien.render.RenderShapeTriangleMeshPart, scale: np.ndarray) -> trimesh.Trimesh:
+def _mesh(
+    part: sapien.render.RenderShapeTriangleMeshPart, scale: np.ndarray
+) -> trimesh.Trimesh:
     vertices, faces = part.vertices * scale, part.triangles
     material = _material(part.material)
     if len(faces) > FINEST:
         vertices, faces = coarser(vertices, faces)
         visual = TextureVisuals(material=material)
         return trimesh.Trimesh(vertices, faces, visual=visual, process=False)
-    normals, visual = part.get_vertex_normal(), TextureVisuals(part.get_vertex_uv(), material)
+    normals, visual = (
+        part.get_vertex_normal(),
+        TextureVisuals(part.get_vertex_uv(), material),
+    )
     return trimesh.Trimesh(
         vertices, faces, vertex_normals=normals, visual=visual, process=False
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 from collections.abc import Callable
+from functools import partial
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -18,8 +19,12 @@ from ir_maniskill.talk import cards
 from ir_maniskill.talk.session import PAPER, Session
 from ir_maniskill.talk.stage import Stage
 
-PICTURE = 192
-"""Height of the policy's pictures on the page [pixel]."""
+PICTURE, ROW = 224, 366
+"""Height of the policy's pictures on the page, and width of their row [pixel]."""
+GAP = 12
+"""Between two pictures [pixel]."""
+BACKGROUND = 36
+"""The panel's gray."""
 EXAMPLES = 9
 """Most examples that are shown."""
 
@@ -43,8 +48,10 @@ class Page:
         self.session = session
         self.paused, self.speed = False, 1.0
         self._wishes: SimpleQueue[Callable[[], None]] = SimpleQueue()
-        with contextlib.redirect_stdout(io.StringIO()):  # viser greets at length
-            self.server = Server(host=host, port=port, label="Talk to it", verbose=False)
+        with _silence():  # viser greets at length
+            self.server = Server(
+                host=host, port=port, label="Talk to it", verbose=False
+            )
         gui = self.server.gui
         gui.configure_theme(
             dark_mode=True, show_logo=False, show_share_button=False,
@@ -73,7 +80,8 @@ class Page:
 
     def close(self) -> None:
         """Close it."""
-        self.server.stop()
+        with _silence():
+            self.server.stop()
 
     # -- Wishes ------------------------------------------------------------------------
 
@@ -101,7 +109,7 @@ class Page:
         form.on_submit(lambda _: self._wish(self.session.tell, line.value))
         self._sentence = gui.add_html("")
         self._lights = gui.add_html("")
-        self._pictures = gui.add_image(np.zeros((PICTURE, PICTURE, 3), np.uint8))
+        self._pictures = gui.add_image(side_by_side([]), format="png")
         with gui.add_folder("Try"):
             self._examples = [self._add_example(line) for _ in range(EXAMPLES)]
         self._note = gui.add_html("")
@@ -144,15 +152,15 @@ class Page:
             )
         )
         with gui.add_folder("Choose"):
-            self._choices = {
+            self._choices: dict[str, Any] = {
                 "task": gui.add_dropdown("Task", catalog.available()),
                 "robot": gui.add_dropdown("Robot", robots),
                 "policy": gui.add_dropdown("Policy", session.players()),
             }
         for kind, box in self._choices.items():
-            box.on_update(lambda event, kind=kind: self._chosen(event, kind))
+            box.on_update(partial(self._chosen, kind))
 
-    def _chosen(self, event: viser.GuiEvent, kind: str) -> None:
+    def _chosen(self, kind: str, event: viser.GuiEvent) -> None:
         if event.client is not None:  # else it was us
             self._wish(self.session.choose, **{kind: event.target.value})
 
@@ -201,12 +209,18 @@ class Page:
 
 
 def side_by_side(pictures: list[np.ndarray]) -> np.ndarray:
-    """Return pictures in a row, a gap between them, at the page's height."""
-    gap = np.full((PICTURE, 8, 3), 36, dtype=np.uint8)
-    row = []
-    for picture in pictures:
-        height, width = picture.shape[:2]
-        size = (round(PICTURE * width / height), PICTURE)
-        smooth = Image.Resampling.NEAREST if height < PICTURE else Image.Resampling.BOX
-        row += [np.asarray(Image.fromarray(picture).resize(size, smooth)), gap]
-    return np.concatenate(row[:-1], axis=1)
+    """Return pictures in the middle of a row, as coarse as they are [H, W, 3] uint8."""
+    row = Image.new("RGB", (ROW, PICTURE), (BACKGROUND,) * 3)
+    wide = [round(PICTURE * p.shape[1] / p.shape[0]) for p in pictures]
+    left = (ROW - sum(wide) - GAP * (len(wide) - 1)) // 2
+    for picture, width in zip(pictures, wide, strict=True):
+        smooth = (
+            Image.Resampling.NEAREST if len(picture) < PICTURE else Image.Resampling.BOX
+        )
+        row.paste(Image.fromarray(picture).resize((width, PICTURE), smooth), (left, 0))
+        left += width + GAP
+    return np.asarray(row)
+
+
+def _silence() -> contextlib.AbstractContextManager:
+    return contextlib.redirect_stdout(io.StringIO())

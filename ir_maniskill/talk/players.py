@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from ir_maniskill import experiment as catalog
-from ir_maniskill.experiment import Experiment, tokenize
+from ir_maniskill.experiment import Experiment
+from ir_maniskill.language.tokens import split_words
 from ir_maniskill.policy import Policy, load_policy, shipped
 from ir_maniskill.training.checkpoint import MismatchError
 
@@ -75,10 +76,8 @@ def load(name: str) -> Policy:
 
 def shortened(policy: Policy, said: str) -> str:
     """Return as many words of a sentence, from its start, as a policy can read."""
-    config, reads = policy.config.agent, policy.agent.encoder.language.reads
-    words = said.split()
-    while "instruction" in reads and len(words) > 1:
-        if len(tokenize(" ".join(words), policy.vocabulary)) <= config.language_length:
-            break
-        words.pop()
-    return " ".join(words)
+    longest = policy.config.agent.language_length
+    if "instruction" in policy.agent.encoder.language.reads:
+        while len(split_words(said)) > longest:
+            said = said[:-1].rstrip()
+    return said

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from ir_maniskill.experiment import Instruction, split_words
+from ir_maniskill.environment.senses import TEXT_BYTES
 from ir_maniskill.goals import (
     COLORS,
     SHAPES,
@@ -15,16 +15,22 @@ from ir_maniskill.goals import (
     Both,
     Goal,
     GoalError,
+    Instruction,
     Push,
     Ref,
     Then,
     Touch,
 )
 from ir_maniskill.language import SentenceError, parse
+from ir_maniskill.language.tokens import split_words
 from ir_maniskill.snapshot import Snapshot
 
-LONGEST = 200
-"""Of a sentence more is not heard [letters]."""
+LONGEST = TEXT_BYTES - 8
+"""Of a sentence no more is heard [byte]."""
+
+
+EXPECTED = 7
+"""How many of the words that were expected are told at most, beyond the first."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +53,9 @@ class Reading:
 
 def clean(text: str) -> str:
     """Return typed text on one line, without what cannot be written."""
-    text = text[: 4 * LONGEST].encode("utf-8", "replace").decode("utf-8")
-    kept = (c if unicodedata.category(c)[0] != "C" else " " for c in text)
-    return " ".join("".join(kept).split())[:LONGEST]
+    kept = (c if unicodedata.category(c)[0] != "C" else " " for c in text[:10_000])
+    line = " ".join("".join(kept).split())
+    return line.encode()[:LONGEST].decode(errors="ignore").strip()
 
 
 def read(
@@ -96,9 +102,12 @@ def _new(text: str, vocabulary: Sequence[str] | None) -> tuple[str, ...]:
 
 
 def _why(error: GoalError) -> str:
-    if isinstance(error, SentenceError):
-        return str(error).partition(": ")[2]
-    return str(error)
+    """Return what is wrong with a sentence, with a few of the words that would do."""
+    if not isinstance(error, SentenceError):
+        return str(error)
+    _, _, complaint = str(error).partition(": ")
+    first, *more = complaint.split(", ")
+    return ", ".join([first, *more[:EXPECTED]]) + ", ..." * (len(more) > EXPECTED)
 
 
 # -- Meaning ---------------------------------------------------------------------------

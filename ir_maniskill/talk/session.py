@@ -6,21 +6,27 @@ All calls come from one thread, the simulator's. Legend: F fingers, C objects, B
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import sapien
 import torch
+from mani_skill.utils.structs import Actor
 
 from ir_maniskill import experiment as catalog
+from ir_maniskill.checks import require
 from ir_maniskill.environment.robots.nao import Nao
 from ir_maniskill.environment.senses import cameras
 from ir_maniskill.environment.table_scene import OBJECT_HEIGHT, TABLE_TOP
-from ir_maniskill.experiment import OBJECT_SIZE, TABLE, Instruction
-from ir_maniskill.goals import SHAPES
+from ir_maniskill.experiment import OBJECT_SIZE, TABLE, Spoken
+from ir_maniskill.goals import Goal, GoalError, Instruction
+from ir_maniskill.language import draw, say, things
+from ir_maniskill.language.tokens import split_words
 from ir_maniskill.policy import Policy
 from ir_maniskill.snapshot import Snapshot
 from ir_maniskill.talk.players import RANDOM, RandomMotion, fitting, load, shortened
@@ -111,17 +117,26 @@ class Session:
         Raises:
             CheckpointError: There is no such policy.
             MismatchError: It was trained for another robot or other words.
+            ValueError: No policy fits the task and the robot.
             ExperimentError: The robot cannot reach what the task lays out.
         """
         self.note = ""
         """What the visitor should know of what was asked for last."""
         self.run: Run | None = None
+        self.reading: Reading
+        self.score: Score
         self._checkpoint = checkpoint
         self._envs: dict[str, Any] = {}
         if checkpoint is not None:
             fits = load(str(checkpoint)).require_match
             fits(catalog.get(task), robot, any_task=True)
         players = fitting(task, robot, checkpoint)
+        require(
+            not policy or players[0] != RANDOM,
+            "policy",
+            f"none that fits {task} on the robot {robot!r}",
+            "a checkpoint (--checkpoint FILE), or random motion (--no-policy)",
+        )
         self.seed, self._random = seed - 1, not policy
         self._enter(Choice(task, robot, players[0] if policy else RANDOM))
 
@@ -139,7 +154,7 @@ class Session:
         players = self.players(choice)
         if "policy" in wanted:
             self._random = choice.policy == RANDOM
-        elif self._random or choice.policy not in players or "task" in wanted:
+        else:
             choice = replace(choice, policy=RANDOM if self._random else players[0])
         try:
             if choice.policy not in players:
@@ -186,10 +201,12 @@ class Session:
         self._say(heard)
 
     def _begin(self) -> None:
-        self.note, self.held = "", None
+        self.note = ""
+        self.held: tuple[int, float, float] | None = None
         self.obs, _ = self.env.reset(seed=self.seed)
         self._policy.reset()
-        self._bodies = [e for e in self.env.scene.sub_scenes[0].entities if _visible(e)]
+        entities = self.env.scene.sub_scenes[0].entities
+        self._bodies = [entity for entity in entities if _visible(entity)]
         self.before = self.poses()
 
     # -- Sentences ---------------------------------------------------------------------
@@ -214,24 +231,42 @@ class Session:
             reading = replace(reading, said=said)
         if reading.goal is not None:
             try:
-                _instruct(self.env, Instruction(reading.said, reading.goal))
+                self._judge_by(reading.said, reading.goal)
             except ValueError as error:  # e.g. of a hand that this robot lacks
                 reading = replace(reading, goal=None, meaning=str(error), objects=())
         self.reading, self.score = reading, Score()
         self._touching = [False] * len(self.env.agent.fingers)
 
+    def _judge_by(self, said: str, goal: Goal) -> None:
+        """Have the env measure a goal; the policy reads what is said, however long."""
+        longest = self.env.experiment.max_tokens
+        fits = len(split_words(said)) <= longest
+        self.env.tell(Instruction(said if fits else "", goal))
+
     def _known(self) -> Sequence[Instruction]:
-        """Return the task's own sentences, or those of this scene."""
+        """Return the task's own sentences; of the language there are none."""
         known = self.env.experiment.instructions
-        return known if isinstance(known, tuple) else self.env.instructions
+        return () if isinstance(known, Spoken) else known
 
     def examples(self) -> list[str]:
-        """Return sentences to try, the task's first."""
-        known = dict.fromkeys(i.text for i in self._known())
-        name = next(name for name in self.names if name)
-        color = name.split()[0]
-        more = (f"please tap the {color} one", "Touch the leftmost one.", "dance!")
-        return [*list(known)[:6], *more]
+        """Return sentences to try: the task's, or what can be said of this scene."""
+        if known := self._known():
+            color = next(name for name in self.names if name).split()[0]
+            more = (f"please tap the {color} one", "Touch the leftmost one.", "dance!")
+            return [*[i.text for i in known[:5]], *more]
+        (here,) = things(self.scene)
+        spoken, rng = self.env.experiment.instructions, Random(self.seed)
+        found = []
+        for _ in range(6):
+            with suppress(GoalError):  # of some scenes there is little to say
+                goal = draw(here, spoken.kinds, rng, allows=self._allows)
+                found.append(say(goal, rng))
+        return list(dict.fromkeys(found))
+
+    def _allows(self, acts: Sequence[tuple[str, int]]) -> bool:
+        """Return whether the robot has the hands that verbs ask for."""
+        hands = [verb.split()[0] for verb, _ in acts if verb.endswith(" hand")]
+        return set(hands) <= self.env.agent.hands.keys()
 
     # -- Objects -----------------------------------------------------------------------
 
@@ -244,6 +279,10 @@ class Session:
     def names(self) -> list[str]:
         """What the C objects are called; "" where there is none."""
         return names(self.scene)
+
+    def thing(self, index: int) -> Actor:
+        """Return the body of an object."""
+        return self.env.table.bodies[int(self.env.table.slot[0, index])]
 
     def drag(self, index: int, x: float, y: float) -> None:
         """Hold an object over a place on the table, in the world [m]; see `drop`.
@@ -272,9 +311,9 @@ class Session:
         """Put the held object where it is held, at rest on the table."""
         assert self.held is not None
         index, x, y = self.held
-        height = OBJECT_HEIGHT[SHAPES[int(self.scene.shape[0, index])]]
-        z = self.env.agent.scale * (TABLE_TOP + height / 2)
-        thing = self.env.objects[index]
+        shape = self.names[index].split()[1]
+        z = self.env.agent.scale * (TABLE_TOP + OBJECT_HEIGHT[shape] / 2)
+        thing = self.thing(index)
         thing.set_pose(sapien.Pose([x, y, z]))
         if thing.px_body_type == "dynamic":
             thing.set_linear_velocity(torch.zeros(1, 3))
@@ -368,24 +407,6 @@ class Session:
         return {hand: {finger: next(left) for finger in mine} for hand, mine in hands}
 
 
-def _instruct(env: Any, instruction: Instruction) -> None:
-    """Give the env an instruction, without a reset."""
-    if hasattr(env, "tell"):
-        env.tell(instruction)
-        return
-    # TODO: local adapter for an env without `tell`.
-    from ir_maniskill.environment.bodies import poses
-    from ir_maniskill.environment.instructional_set import GoalTable
-    from ir_maniskill.environment.touch_env import _hands
-
-    hands = {n: torch.tensor(f) for n, f in _hands(env.agent).items()}
-    table = GoalTable([instruction.goal], hands, env.device)
-    env._start = poses(env.objects)
-    env._stage = torch.zeros_like(env._stage)
-    env._success_once = torch.zeros_like(env._success_once)
-    env._wrong_once = torch.zeros_like(env._wrong_once)
-    env._goals = table.deal(torch.zeros(1, dtype=torch.int64), env.snapshot())
-
-
 def _visible(entity: sapien.Entity) -> bool:
-    return entity.find_component_by_type(sapien.render.RenderBodyComponent) is not None
+    body = entity.find_component_by_type(sapien.render.RenderBodyComponent)
+    return body is not None and body.is_enabled
