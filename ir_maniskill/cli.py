@@ -22,7 +22,7 @@ from tyro.conf import Positional, arg, subcommand
 from ir_maniskill import api, bench, doctor
 from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.robots.robot import Robot, available_robots, short_name
-from ir_maniskill.evaluation import plots
+from ir_maniskill.evaluation import plots, video
 from ir_maniskill.evaluation.evaluate import EVALUATION_SEED, write_report
 from ir_maniskill.experiment import Drawn, Experiment, Spoken
 from ir_maniskill.files import require_writable, write_json
@@ -242,6 +242,56 @@ class Video(_Play):
 
 
 @dataclasses.dataclass(frozen=True)
+class Talk:
+    """Open a page to talk to a robot: type a sentence, watch it do as told."""
+
+    env_id: TaskId = "NaoTouchCubeShuffled-v1"
+    """Task whose scene it is; MODULE is imported first."""
+    checkpoint: Path | None = None
+    """Policy or checkpoint file; None: the one that ships with the package."""
+    policy: bool = True
+    """Whether a policy moves the robot; --no-policy: random motion."""
+    robot: str = "nao"
+    """Who does it: nao, g1, panda."""
+    host: str = "127.0.0.1"
+    """Address to listen at; 0.0.0.0 lets everybody in your network talk to it."""
+    port: int = 8080
+    """Port to listen at, or the next one that is free."""
+    record: Path | None = None
+    """Film to write in the end (.mp4, .gif), of the last three minutes."""
+    seed: int = EVALUATION_SEED
+    """Seed of the first scene."""
+
+    def run(self) -> None:
+        """Keep the page open until Ctrl-C."""
+        try:
+            from ir_maniskill.talk import live  # viser is an extra
+            from ir_maniskill.talk.session import Session
+        except ModuleNotFoundError as error:
+            if error.name != "viser":
+                raise
+            raise UsageError(
+                "talk: got no module 'viser', expected it installed: "
+                "pip install 'ir-maniskill[talk]'"
+            ) from None
+        if self.record is not None:
+            video.check_name(self.record)
+            require_writable(self.record)
+        live.run(
+            Session(
+                catalog.get(self.env_id).id,
+                robot=self.robot,
+                checkpoint=self.checkpoint,
+                policy=self.policy,
+                seed=self.seed,
+            ),
+            self.host,
+            self.port,
+            self.record,
+        )
+
+
+@dataclasses.dataclass(frozen=True)
 class Curve:
     """Draw the learning curve of a run (.png)."""
 
@@ -358,6 +408,7 @@ def _parse(arguments: Sequence[str], defaults: TrainConfig) -> Any:
         | Evaluate
         | Audit
         | Video
+        | Talk
         | Curve
         | Bench
         | Doctor

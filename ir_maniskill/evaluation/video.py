@@ -115,15 +115,15 @@ def record(
     with closing(gym.make(env_id, num_envs=1, **(env_kwargs or {}))) as env:
         base: Any = env.unwrapped
         told = choose_instructions(base.experiment, instructions)
-        with closing(_stage(env_id, base.agent)) as stage:
+        with closing(stage(env_id, base.agent)) as shown:
             for episode in range(episodes):
                 said = told[episode % len(told)]
                 options = {} if said is None else {"instruction": said}
                 obs, _ = env.reset(seed=seed + episode, options=options)
-                yield from _play(policy, env, obs, StateStack(frames), stage)
+                yield from _play(policy, env, obs, StateStack(frames), shown)
 
 
-def _stage(env_id: str, robot: Robot) -> gym.Env:
+def stage(env_id: str, robot: Robot) -> gym.Env:
     """Make a second scene, to show the first with shadows, large and sharp.
 
     Lights are a scene's, not a camera's: shadows in the policy's own scene would change
@@ -135,7 +135,7 @@ def _stage(env_id: str, robot: Robot) -> gym.Env:
         "pose": view(robot.scale, *VIEWPOINT),
         "fov": 0.58,
     }
-    stage = gym.make(
+    env = gym.make(
         env_id,
         num_envs=1,
         robot_uids=type(robot),
@@ -144,8 +144,8 @@ def _stage(env_id: str, robot: Robot) -> gym.Env:
         enable_shadow=True,
         human_render_camera_configs=camera,
     )
-    stage.reset(seed=0)
-    return stage
+    env.reset(seed=0)
+    return env
 
 
 @torch.no_grad()  # no inference mode: what the env keeps must stay changeable
@@ -324,14 +324,14 @@ def _draw_hands(page: Image.Image, snapshot: Snapshot) -> None:
     for row, (hand, fingers) in enumerate(hands.items()):
         top = y + 14 + row * min(56, 112 // len(hands))
         canvas.text((x + 18, top + 14), hand.upper(), FAINT, _font(13))
-        for column, name in enumerate(_titles(fingers)):
+        for column, name in enumerate(titles(fingers)):
             right, wrong = next(touches)
             color = WRONG if wrong else RIGHT if right else EDGE
             left = x + 84 + column * min(88, 218 // max(len(fingers) - 1, 1))
             _draw_light(page, (left, top), name, color)
 
 
-def _titles(fingers: tuple[str, ...]) -> list[str]:
+def titles(fingers: tuple[str, ...]) -> list[str]:
     """Return names without what all have in front, "LFinger1" as "Finger 1"."""
     letters = zip(*fingers, strict=False)
     same = list(takewhile(lambda column: len(set(column)) == 1, letters))

@@ -1,0 +1,83 @@
+"""What can move the robot: policies that fit a task, and random motion."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ir_maniskill import experiment as catalog
+from ir_maniskill.experiment import Experiment
+from ir_maniskill.language.tokens import split_words
+from ir_maniskill.policy import Policy, load_policy, shipped
+from ir_maniskill.training.checkpoint import MismatchError
+
+RANDOM = "random motion"
+"""Name of what needs no policy."""
+
+
+class RandomMotion:
+    """Wanders about, deaf: for a task or a robot without a policy."""
+
+    vocabulary = None
+    env_kwargs: dict[str, Any] = {  # noqa: RUF012 - read only
+        "obs_mode": "rgb",
+        "control_mode": "pd_joint_target_delta_pos",
+        "reward_mode": "sparse",
+        "sensor_configs": {"width": 64, "height": 128, "shader_pack": "unlit"},
+    }
+    """What an env is made with for it."""
+    STRENGTH, MEMORY = 0.25, 0.9
+    """Share of the largest action, and of the last action that is kept."""
+
+    def __init__(self, joints: int, seed: int = 0) -> None:
+        """Take how many joints there are."""
+        self._generator = torch.Generator().manual_seed(seed)
+        self._action = torch.zeros(1, joints)
+
+    def reset(self) -> None:
+        """Begin from rest."""
+        self._action.zero_()
+
+    def act(self, obs: Any, said: str) -> Tensor:
+        """Return the next action [1, J]."""
+        noise = torch.randn(self._action.shape, generator=self._generator)
+        kick = (1 - self.MEMORY**2) ** 0.5 * self.STRENGTH
+        self._action = self.MEMORY * self._action + kick * noise
+        return self._action.clamp(-1, 1)
+
+
+def fitting(task: str, robot: str, checkpoint: Path | None = None) -> list[str]:
+    """Return what can play a task with a robot, the best first: names for `load`."""
+    experiment = catalog.get(task)
+    files = [str(checkpoint)] if checkpoint else []
+    own = [task] if shipped(task).is_file() else []
+    others = [i for i in catalog.available() if shipped(i).is_file() and i != task]
+    found = [n for n in (*files, *own, *others) if _fits(load(n), experiment, robot)]
+    return [*found, RANDOM]
+
+
+def _fits(policy: Policy, experiment: Experiment, robot: str) -> bool:
+    try:
+        policy.require_match(experiment, robot, any_task=True)
+    except MismatchError:
+        return False
+    return True
+
+
+@cache
+def load(name: str) -> Policy:
+    """Return a policy by its file, or by the task that it ships for; once each."""
+    return load_policy(name, device="cpu")
+
+
+def shortened(policy: Policy, said: str) -> str:
+    """Return as many words of a sentence, from its start, as a policy can read."""
+    longest = policy.config.agent.language_length
+    if "instruction" in policy.agent.encoder.language.reads:
+        while len(split_words(said)) > longest:
+            said = said[:-1].rstrip()
+    return said

@@ -1,0 +1,412 @@
+"""Session: one robot, one scene, and what it is told; no web in here.
+
+All calls come from one thread, the simulator's. Legend: F fingers, C objects, B bodies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import sapien
+import torch
+from mani_skill.utils.structs import Actor
+
+from ir_maniskill import experiment as catalog
+from ir_maniskill.checks import require
+from ir_maniskill.environment.robots.nao import Nao
+from ir_maniskill.environment.senses import cameras
+from ir_maniskill.environment.table_scene import OBJECT_HEIGHT, TABLE_TOP
+from ir_maniskill.experiment import OBJECT_SIZE, TABLE, Spoken
+from ir_maniskill.goals import Goal, GoalError, Instruction
+from ir_maniskill.language import draw, say, things
+from ir_maniskill.language.tokens import split_words
+from ir_maniskill.policy import Policy
+from ir_maniskill.snapshot import Snapshot
+from ir_maniskill.talk.players import RANDOM, RandomMotion, fitting, load, shortened
+from ir_maniskill.talk.reading import Reading, clean, names, read
+
+PAPER = ("NaoTouchCubeSingle-v1", "NaoTouchCubeMulti-v1", "NaoTouchCubeTriangle-v1")
+"""The paper's experiments I to III."""
+APART = 1.25 * OBJECT_SIZE
+"""How near an object may be dragged to another one, between centers [m]."""
+LASTS = 2
+"""How long a run of an experiment gives each sentence [episodes]."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What is played."""
+
+    task: str
+    """Id of the task."""
+    robot: str
+    """Its name."""
+    policy: str
+    """Name of what moves it."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """What came of the sentence so far."""
+
+    success: bool = False
+    """Whether the goal holds now."""
+    success_once: bool = False
+    """Whether it has held."""
+    wrong: int = 0
+    """How often a finger began to touch what the sentence does not allow."""
+    steps: int = 0
+    """Steps since it was said."""
+    reward: float = 0.0
+    """Sum of the rewards since then."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run of an experiment: its sentences one after the other."""
+
+    task: str
+    """Id of the experiment."""
+    sentences: tuple[str, ...]
+    """What is said, in order."""
+    reached: tuple[bool, ...] = ()
+    """Of those that are over: whether the goal was reached."""
+
+    @property
+    def over(self) -> bool:
+        """Whether all sentences are."""
+        return len(self.reached) == len(self.sentences)
+
+
+class Session:
+    """A conversation with one robot.
+
+    Example:
+        >>> session = Session("NaoTouchCubeShuffled-v1")
+        >>> session.tell("Touch the red cube.")
+        >>> for _ in range(60):
+        ...     session.step()
+        >>> session.score.success_once
+    """
+
+    def __init__(
+        self,
+        task: str,
+        *,
+        robot: str = Nao.uid,
+        checkpoint: Path | None = None,
+        policy: bool = True,
+        seed: int = 0,
+    ) -> None:
+        """Open the scene.
+
+        Args:
+            task: Id of the task.
+            robot: Who does it.
+            checkpoint: A policy's file; None: what ships for the task.
+            policy: Whether a policy moves the robot, or chance.
+            seed: Seed of the first scene.
+
+        Raises:
+            CheckpointError: There is no such policy.
+            MismatchError: It was trained for another robot or other words.
+            ValueError: No policy fits the task and the robot.
+            ExperimentError: The robot cannot reach what the task lays out.
+        """
+        self.note = ""
+        """What the visitor should know of what was asked for last."""
+        self.run: Run | None = None
+        self.reading: Reading
+        self.score: Score
+        self._checkpoint = checkpoint
+        self._envs: dict[str, Any] = {}
+        if checkpoint is not None:
+            fits = load(str(checkpoint)).require_match
+            fits(catalog.get(task), robot, any_task=True)
+        players = fitting(task, robot, checkpoint)
+        require(
+            not policy or players[0] != RANDOM,
+            "policy",
+            f"none that fits {task} on the robot {robot!r}",
+            "a checkpoint (--checkpoint FILE), or random motion (--no-policy)",
+        )
+        self.seed, self._random = seed - 1, not policy
+        self._enter(Choice(task, robot, players[0] if policy else RANDOM))
+
+    def close(self) -> None:
+        """Close all scenes."""
+        for env in self._envs.values():
+            env.close()
+        self._envs.clear()
+
+    # -- What is played ----------------------------------------------------------------
+
+    def choose(self, **wanted: str) -> None:
+        """Change task, robot or policy, by name; what does not fit changes nothing."""
+        choice = replace(self.choice, **wanted)
+        players = self.players(choice)
+        if "policy" in wanted:
+            self._random = choice.policy == RANDOM
+        else:
+            choice = replace(choice, policy=RANDOM if self._random else players[0])
+        try:
+            if choice.policy not in players:
+                raise ValueError(f"{choice.policy} does not fit, try {players[0]}.")
+            self._enter(choice)
+        except ValueError as error:
+            self.note = str(error)
+
+    def players(self, choice: Choice | None = None) -> list[str]:
+        """Return the names of what can move the robot in the task, the best first."""
+        choice = choice or self.choice
+        return fitting(choice.task, choice.robot, self._checkpoint)
+
+    def _enter(self, choice: Choice) -> None:
+        self.env, self._policy = self._stage(choice)
+        self.choice = choice
+        self.new_scene()
+
+    def _stage(self, choice: Choice) -> tuple[Any, Policy | RandomMotion]:
+        """Return the env of a choice, which is made once, and what plays there."""
+        policy = None if choice.policy == RANDOM else load(choice.policy)
+        kwargs = (policy or RandomMotion).env_kwargs | {"robot_uids": choice.robot}
+        key = f"{choice.task} {kwargs}"
+        if key not in self._envs:
+            # Without its wrappers: what is live has no time limit.
+            self._envs[key] = gym.make(choice.task, num_envs=1, **kwargs).unwrapped
+        env = self._envs[key]
+        return env, policy or RandomMotion(len(env.agent.joints))
+
+    # -- Scenes ------------------------------------------------------------------------
+
+    def new_scene(self) -> None:
+        """Lay the objects out anew, with one of the task's sentences."""
+        self.run = None
+        self.seed += 1
+        self._begin()
+        self._say(self.env.get_language_instruction()[0])
+
+    def reset(self) -> None:
+        """Begin again in the same scene, with the same sentence."""
+        self.run = None
+        heard = self.reading.heard
+        self._begin()
+        self._say(heard)
+
+    def _begin(self) -> None:
+        self.note = ""
+        self.held: tuple[int, float, float] | None = None
+        self.obs, _ = self.env.reset(seed=self.seed)
+        self._policy.reset()
+        entities = self.env.scene.sub_scenes[0].entities
+        self._bodies = [entity for entity in entities if _visible(entity)]
+        self.before = self.poses()
+
+    # -- Sentences ---------------------------------------------------------------------
+
+    def tell(self, text: str) -> None:
+        """Say something to the robot, as it goes on; anything may be said."""
+        heard = clean(text)
+        if not any(letter.isalnum() for letter in heard):
+            self.note = "Nothing was said: type a sentence."
+            return
+        self.run = None
+        self.note = "Only the start was heard." if len(text) > len(heard) + 20 else ""
+        self._say(heard)
+
+    def _say(self, heard: str) -> None:
+        policy = self._policy
+        reading = read(heard, self._known(), self.scene, policy.vocabulary)
+        if isinstance(policy, Policy):
+            said = shortened(policy, reading.said)
+            if said != reading.said:
+                self.note = f"It cannot read more than: {said}"
+            reading = replace(reading, said=said)
+        if reading.goal is not None:
+            try:
+                self._judge_by(reading.said, reading.goal)
+            except ValueError as error:  # e.g. of a hand that this robot lacks
+                reading = replace(reading, goal=None, meaning=str(error), objects=())
+        self.reading, self.score = reading, Score()
+        self._touching = [False] * len(self.env.agent.fingers)
+
+    def _judge_by(self, said: str, goal: Goal) -> None:
+        """Have the env measure a goal; the policy reads what is said, however long."""
+        longest = self.env.experiment.max_tokens
+        fits = len(split_words(said)) <= longest
+        self.env.tell(Instruction(said if fits else "", goal))
+
+    def _known(self) -> Sequence[Instruction]:
+        """Return the task's own sentences; of the language there are none."""
+        known = self.env.experiment.instructions
+        return () if isinstance(known, Spoken) else known
+
+    def examples(self) -> list[str]:
+        """Return sentences to try: the task's, or what can be said of this scene."""
+        if known := self._known():
+            color = next(name for name in self.names if name).split()[0]
+            more = (f"please tap the {color} one", "Touch the leftmost one.", "dance!")
+            return [*[i.text for i in known[:5]], *more]
+        (here,) = things(self.scene)
+        spoken, rng = self.env.experiment.instructions, Random(self.seed)
+        found = []
+        for _ in range(6):
+            with suppress(GoalError):  # of some scenes there is little to say
+                goal = draw(here, spoken.kinds, rng, allows=self._allows)
+                found.append(say(goal, rng))
+        return list(dict.fromkeys(found))
+
+    def _allows(self, acts: Sequence[tuple[str, int]]) -> bool:
+        """Return whether the robot has the hands that verbs ask for."""
+        hands = [verb.split()[0] for verb, _ in acts if verb.endswith(" hand")]
+        return set(hands) <= self.env.agent.hands.keys()
+
+    # -- Objects -----------------------------------------------------------------------
+
+    @property
+    def scene(self) -> Snapshot:
+        """What goals are measured on, as of now."""
+        return self.env.snapshot()
+
+    @property
+    def names(self) -> list[str]:
+        """What the C objects are called; "" where there is none."""
+        return names(self.scene)
+
+    def thing(self, index: int) -> Actor:
+        """Return the body of an object."""
+        return self.env.table.bodies[int(self.env.table.slot[0, index])]
+
+    def drag(self, index: int, x: float, y: float) -> None:
+        """Hold an object over a place on the table, in the world [m]; see `drop`.
+
+        Off the table, or where another object is, it stays where it was.
+        """
+        scale, half = self.env.agent.scale, OBJECT_SIZE / 2
+        place = [
+            min(max(value / scale, low + half), high - half)
+            for value, (low, high) in zip((x, y), TABLE, strict=True)
+        ]  # at NAO's scale
+        here = self.scene.position[0, :, :2].numpy()
+        apart = np.linalg.norm(here - np.array(place), axis=1)
+        others = [i for i, name in enumerate(self.names) if name and i != index]
+        if all(apart[i] >= APART for i in others):
+            self.held = index, scale * place[0], scale * place[1]
+            self._carry()
+
+    def drop(self) -> None:
+        """Let go of the object that is held; the sentence counts from here."""
+        if self.held is not None:
+            self.held = None
+            self._say(self.reading.heard)
+
+    def _carry(self) -> None:
+        """Put the held object where it is held, at rest on the table."""
+        assert self.held is not None
+        index, x, y = self.held
+        shape = self.names[index].split()[1]
+        z = self.env.agent.scale * (TABLE_TOP + OBJECT_HEIGHT[shape] / 2)
+        thing = self.thing(index)
+        thing.set_pose(sapien.Pose([x, y, z]))
+        if thing.px_body_type == "dynamic":
+            thing.set_linear_velocity(torch.zeros(1, 3))
+            thing.set_angular_velocity(torch.zeros(1, 3))
+
+    # -- Time --------------------------------------------------------------------------
+
+    def step(self) -> None:
+        """Go on for one control step of 50 ms."""
+        self.before = self.poses()
+        if self.held is not None:
+            self._carry()
+        action = self._policy.act(self.obs, self.reading.said)
+        self.obs, reward, _, _, info = self.env.step(action)
+        self._count(float(reward), info)
+        self._go_on()
+
+    def _count(self, reward: float, info: dict[str, torch.Tensor]) -> None:
+        """Add what the step brought to the score."""
+        wrong = self.env.verdict.wrong[0].tolist()
+        pairs = zip(wrong, self._touching, strict=True)
+        began = sum(now and not before for now, before in pairs)
+        judged, self._touching = self.reading.goal is not None, wrong
+        self.score = Score(
+            success=judged and bool(info["success"]),
+            success_once=judged and bool(info["success_once"]),
+            wrong=self.score.wrong + began * judged,
+            steps=self.score.steps + 1,
+            reward=self.score.reward + reward,
+        )
+
+    # -- The paper's experiments -------------------------------------------------------
+
+    def experiment(self, task: str) -> None:
+        """Run an experiment: each of its sentences once, in scenes of their own."""
+        self.choose(task=task, robot=Nao.uid, policy=task)
+        self.run = Run(task, tuple(i.text for i in self._known()))
+        self._say(self.run.sentences[0])
+
+    def _go_on(self) -> None:
+        """Go on to the next sentence of a run, once one had its time."""
+        run, time = self.run, LASTS * self.env.experiment.episode_steps
+        if run is None or run.over or self.score.steps < time:
+            return
+        reached = (*run.reached, self.score.success_once)
+        run = replace(run, reached=reached)
+        if not run.over:
+            self.new_scene()
+            self._say(run.sentences[len(reached)])
+        self.run = run
+
+    # -- What is to be seen ------------------------------------------------------------
+
+    def bodies(self) -> list[sapien.Entity]:
+        """Return the B bodies that can be seen."""
+        return list(self._bodies)
+
+    def poses(self) -> np.ndarray:
+        """Return where they are: positions [m] and quaternions (w, x, y, z) [B, 7]."""
+        return np.array([[*e.pose.p, *e.pose.q] for e in self._bodies])
+
+    def fingertips(self) -> np.ndarray:
+        """Return where the fingertips are [F, 3] [m]."""
+        return self.env.agent.finger_position()[0].numpy()
+
+    def between(self, share: float) -> np.ndarray:
+        """Return poses between the last step's start, at 0, and now, at 1 [B, 7]."""
+        now, before = self.poses(), self.before
+        same = np.sign((before[:, 3:] * now[:, 3:]).sum(axis=1, keepdims=True))
+        before = np.concatenate([before[:, :3], same * before[:, 3:]], axis=1)
+        poses = before + share * (now - before)
+        poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
+        return poses
+
+    def pictures(self) -> dict[str, np.ndarray]:
+        """Return what the policy's cameras see, by name [H, W, 3] uint8."""
+        seen = self.obs.get("sensor_data", {})
+        return {name: seen[name]["rgb"][0].cpu().numpy() for name in cameras(self.obs)}
+
+    def lights(self) -> dict[str, dict[str, str]]:
+        """Return what each finger of each hand touches: "right", "wrong" or ""."""
+        verdict, states = self.env.verdict, []
+        touching = self.scene.contact[0].any(dim=1)
+        for right, wrong, any_ in zip(
+            verdict.right[0], verdict.wrong[0], touching, strict=True
+        ):
+            state = "wrong" if wrong else "right" if right else ""
+            states.append(state if self.reading.goal else "touch" * bool(any_))
+        left = iter(states)
+        hands = self.env.agent.hands.items()
+        return {hand: {finger: next(left) for finger in mine} for hand, mine in hands}
+
+
+def _visible(entity: sapien.Entity) -> bool:
+    body = entity.find_component_by_type(sapien.render.RenderBodyComponent)
+    return body is not None and body.is_enabled

@@ -1,0 +1,164 @@
+"""Stage: the robot, the table and the objects in the visitors' browsers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import sapien
+import trimesh
+import viser
+
+from ir_maniskill.environment.table_scene import TABLE_TOP
+from ir_maniskill.talk import meshes
+from ir_maniskill.talk.cards import COLORS
+from ir_maniskill.talk.session import Session
+
+EYE, TARGET = (0.80, 0.34, 0.44), (0.10, 0.0, 0.06)
+"""Where visitors look from, and at, at NAO's scale [m]."""
+SUN = (0.55, 0.35, 1.0)
+"""Where light comes from, as for films."""
+LIGHT = 0.011
+"""Radius of the light at a fingertip [m]."""
+RING = (0.038, 0.002)
+"""Radii of the ring around an object that is meant [m]."""
+STILL = 1e-5
+"""What moves less is not sent anew [m, or of a quaternion]."""
+
+
+class Stage:
+    """What is drawn of a session: a node for each body that can be seen."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        drag: Callable[[int, float, float], None],
+        drop: Callable[[], None],
+    ) -> None:
+        """Light the stage; `drag` and `drop` hear of what visitors do to objects."""
+        self._server, self._drag, self._drop = server, drag, drop
+        self._robot = ""
+        self._bodies: dict[str, Any] = {}
+        self._sent: dict[str, np.ndarray] = {}
+        self._marks: list[Any] = []
+        self._lights: list[Any] = []
+        self._rings: list[Any] = []
+        self._things: dict[str, int] = {}
+        scene = server.scene
+        scene.world_axes.visible = False
+        scene.set_background_image(np.full((2, 2, 3), 24, dtype=np.uint8))
+        scene.configure_default_lights(enabled=False)
+        sky, ground = (235, 236, 240), (130, 118, 104)
+        scene.configure_environment_map("studio", environment_intensity=0.15)
+        scene.add_light_hemisphere(
+            "/sky", sky_color=sky, ground_color=ground, intensity=0.8
+        )
+        scene.add_light_directional(
+            "/sun", position=SUN, intensity=1.5, cast_shadow=True
+        )
+
+    def build(self, session: Session) -> None:
+        """Bring what the session's scene has; most of it is there already."""
+        if self._robot != session.choice.robot:
+            self._change_robot(session)
+        bodies = {body.name: body for body in session.bodies()}
+        things = {
+            session.thing(place)._objs[0].name: place
+            for place, name in enumerate(session.names)
+            if name
+        }
+        if self._things == things and self._bodies.keys() == bodies.keys():
+            return
+        self._things = things
+        for name in self._bodies.keys() - bodies.keys():
+            self._bodies.pop(name).remove()
+            del self._sent[name]
+        for name in bodies.keys() - self._bodies.keys():
+            self._bodies[name] = self._add(bodies[name])
+            self._sent[name] = np.full(7, np.nan)
+        self._add_marks(session)
+
+    def _change_robot(self, session: Session) -> None:
+        """Clear the stage; have those who are here, and who come, look at the table."""
+        self._robot, scale = session.choice.robot, session.env.agent.scale
+        for node in self._bodies.values():
+            node.remove()
+        self._bodies, self._sent, self._things = {}, {}, {}
+        cameras: list[Any] = [self._server.initial_camera]
+        cameras += [client.camera for client in self._server.get_clients().values()]
+        for camera in cameras:
+            camera.position = tuple(scale * value for value in EYE)
+            camera.look_at = tuple(scale * value for value in TARGET)
+            camera.fov, camera.near, camera.far = 0.6, 0.05 * scale, 20 * scale
+
+    def _add(self, body: sapien.Entity) -> Any:
+        name = f"/{self._robot}/{body.name.replace('/', '_')}"
+        shadow = not body.name.endswith("room")  # it would throw one on itself
+        add = self._server.scene.add_glb
+        node: Any = add(name, meshes.glb(body), cast_shadow=shadow)
+        if body.name in self._things:
+            self._make_draggable(node, body.name)
+        return node
+
+    def _make_draggable(self, node: Any, name: str) -> None:
+        """Let visitors drag an object along the table."""
+
+        async def on_drag(event: viser.SceneNodeDragEvent) -> None:
+            if event.phase == "end" or name not in self._things:
+                self._drop()
+                return
+            eye = np.asarray(event.client.camera.position)
+            ray = np.asarray(event.end_position) - eye
+            height = event.start_position[2] - eye[2]
+            if ray[2] * height > 0:  # it points to where the object can be
+                x, y, _ = eye + ray * height / ray[2]
+                self._drag(self._things[name], float(x), float(y))
+
+        node.on_drag(on_drag)
+
+    def _add_marks(self, session: Session) -> None:
+        """Bring a light for each finger and a ring for each object, not yet shown."""
+        for mark in self._marks:
+            mark.remove()
+        scale, add = session.env.agent.scale, self._server.scene.add_mesh_simple
+        ball = trimesh.creation.icosphere(3, LIGHT * scale)
+        ring = trimesh.creation.torus(*(scale * radius for radius in RING))
+        looks: dict[str, Any] = {"cast_shadow": False, "visible": False}
+        self._lights = [
+            add(f"/marks/{finger}", ball.vertices, ball.faces, opacity=0.7, **looks)
+            for finger in session.env.agent.fingers
+        ]
+        self._rings = [
+            add(f"/marks/{n}", ring.vertices, ring.faces, color=(255,) * 3, **looks)
+            for n in range(len(session.names))
+        ]
+        self._marks = [*self._lights, *self._rings]
+
+    def move(self, session: Session, poses: np.ndarray) -> None:
+        """Draw the bodies where they are: their poses [B, 7]."""
+        for body, pose in zip(session.bodies(), poses, strict=True):
+            if not np.abs(pose - self._sent[body.name]).max() < STILL:
+                node, self._sent[body.name] = self._bodies[body.name], pose
+                node.position, node.wxyz = pose[:3], pose[3:]
+
+    def mark(self, session: Session) -> None:
+        """Light the fingertips that touch, and ring the objects that are meant."""
+        states = [s for hand in session.lights().values() for s in hand.values()]
+        tips = session.fingertips()
+        for light, state, tip in zip(self._lights, states, tips, strict=True):
+            if state:
+                light.position = tip
+                light.color = tuple(bytes.fromhex(COLORS[state][1:]))
+            _show(light, bool(state))
+        scale = session.env.agent.scale
+        where = session.scene.position[0].numpy()
+        for place, ring in enumerate(self._rings):
+            _show(ring, meant := place in session.reading.objects)
+            if meant:
+                ring.position = scale * np.array([*where[place, :2], TABLE_TOP])
+
+
+def _show(node: Any, visible: bool) -> None:
+    if node.visible != visible:
+        node.visible = visible
