@@ -7,8 +7,10 @@ Legend: N envs, F fingers, C objects.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
 
@@ -52,3 +54,30 @@ class Snapshot:
     def at_stage(self, stage: Tensor) -> Snapshot:
         """Return the same scenes at another stage of their goals [N] int64."""
         return replace(self, stage=stage)
+
+    def pack(self) -> Tensor:
+        """Return all of it as one row of numbers per env [N, P] float32."""
+        return torch.cat([part.flatten(1).float() for part in vars(self).values()], 1)
+
+    @classmethod
+    def unpack(cls, rows: Tensor, fingers: int) -> Snapshot:
+        """Return what `pack` made of scenes with F fingers [..., P] -> [..., F, C]."""
+        # P = F C + 3 F + 19 C + 1: contact, fingertip, all that objects have, stage
+        objects = (rows.shape[-1] - 3 * fingers - 1) // (fingers + 19)
+        shapes = {
+            "contact": (fingers, objects),
+            "fingertip": (fingers, 3),
+            "pose": (objects, 7),
+            "start": (objects, 7),
+            "velocity": (objects, 3),
+            "color": (objects,),
+            "shape": (objects,),
+            "stage": (),
+        }
+        sizes = [math.prod(shape) for shape in shapes.values()]
+        parts = zip(shapes.items(), rows.split(sizes, dim=-1), strict=True)
+        fields = {k: v.reshape(*rows.shape[:-1], *shape) for (k, shape), v in parts}
+        fields["contact"] = fields["contact"] > 0
+        for name in ("color", "shape", "stage"):
+            fields[name] = fields[name].long()
+        return cls(**fields)
