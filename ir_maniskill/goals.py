@@ -176,6 +176,9 @@ class Measure:
     """Objects whose motion the dense reward penalizes [N, C] bool; None: none."""
     may_move: Tensor = None  # type: ignore[assignment]
     """Objects that may be moved; moving others is a foul [N, C] bool; None: all."""
+    aim: Tensor = None  # type: ignore[assignment]
+    """Where fingertips should be to serve it, from each object's center [N, C, 3] [m];
+    None: at it."""
     stage: Tensor = None  # type: ignore[assignment]
     """How many goals of a sequence `Then` are reached [N] int64; None: 0."""
 
@@ -186,6 +189,7 @@ class Measure:
             "level": self.holds.float,
             "still": lambda: torch.zeros_like(objects),
             "may_move": lambda: torch.ones_like(objects),
+            "aim": lambda: objects[..., None] * torch.zeros(3, device=objects.device),
             "stage": lambda: torch.zeros_like(self.holds, dtype=torch.int64),
         }
         for name, make in defaults.items():
@@ -280,6 +284,8 @@ class Push(Goal):
 
     STRAIGHT = 0.6
     """Largest share of the way that it may stray to the side."""
+    BEHIND = 0.04
+    """How far behind its center fingers should be to push it [m]."""
 
     def __post_init__(self) -> None:
         self._check(ref=Ref, distance=Real)
@@ -298,7 +304,10 @@ class Push(Goal):
         gap = ((asked.distance - along).clamp(min=0) + strayed).masked_fill(holds, 0.0)
         progress = (along / asked.distance).clamp(-1, 1)
         serves = asked.ref[:, None].expand_as(scene.contact)
-        return Measure(holds, gap, serves, level=progress, may_move=asked.ref)
+        behind = -Push.BEHIND * asked.ref[..., None] * asked.direction[:, None]
+        return Measure(
+            *(holds, gap, serves), level=progress, may_move=asked.ref, aim=behind
+        )
 
 
 @dataclass(frozen=True)
@@ -347,6 +356,7 @@ class Both(Goal):
             level=a.level + b.level,
             still=a.still | b.still,
             may_move=a.may_move | b.may_move,
+            aim=a.aim + b.aim,
         )
 
 

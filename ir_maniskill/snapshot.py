@@ -49,7 +49,16 @@ class Snapshot:
     @property
     def distance(self) -> Tensor:
         """From each fingertip to each object's center [N, F, C] [m]."""
-        return (self.fingertip[:, :, None] - self.position[:, None]).norm(dim=-1)
+        return self.to_object.norm(dim=-1)
+
+    @property
+    def to_object(self) -> Tensor:
+        """From each object's center to each fingertip [N, F, C, 3] [m]."""
+        return self.fingertip[:, :, None] - self.position[:, None]
+
+    def rows(self, index: Tensor) -> Snapshot:
+        """Return some of the scenes [M], each as often as its row is named."""
+        return Snapshot(*(part[index] for part in vars(self).values()))
 
     def at_stage(self, stage: Tensor) -> Snapshot:
         """Return the same scenes at another stage of their goals [N] int64."""
@@ -57,7 +66,8 @@ class Snapshot:
 
     def pack(self) -> Tensor:
         """Return all of it as one row of numbers per env [N, P] float32."""
-        return torch.cat([part.flatten(1).float() for part in vars(self).values()], 1)
+        parts = [part.reshape(len(part), -1) for part in vars(self).values()]
+        return torch.cat([part.float() for part in parts], dim=1)
 
     @classmethod
     def unpack(cls, rows: Tensor, fingers: int) -> Snapshot:

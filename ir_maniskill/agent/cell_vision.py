@@ -43,11 +43,7 @@ class CameraCells(nn.Module):
 
     def forward(self, cells: Tensor, language: Tensor, dtype: torch.dtype) -> Tensor:
         """Return the flat maps [N, D] of the cells [N, H, W, S * 48]."""
-        # Bytes are exact in 16 bits; weights bring them to [-1, 1], not a pass over all
-        weight = self.cells.weight * (2 / 255)
-        bias = self.cells.bias - self.cells.weight.sum(dim=1)
-        maps = functional.linear(cells.to(dtype), weight.to(dtype), bias.to(dtype))
-        maps = _normed(maps)
+        maps = _normed(self.read(cells, dtype))
         for convolve, film in zip(self.convolutions, self.films, strict=True):
             maps = functional.conv2d(
                 maps.permute(0, 3, 1, 2),  # channels stay last in memory
@@ -56,9 +52,16 @@ class CameraCells(nn.Module):
                 stride=convolve.stride,
                 padding=convolve.padding,
             )
-            maps = film(maps, language).to(dtype).permute(0, 2, 3, 1)
+            maps = film(maps, language).permute(0, 2, 3, 1)
             maps = _normed(maps)
         return maps.flatten(1)
+
+    def read(self, cells: Tensor, dtype: torch.dtype) -> Tensor:
+        """Return a linear map of cells [N, H, W, S * 48] as numbers from -1 to 1."""
+        # Bytes are exact in 16 bits, and scaling weights is less than scaling them.
+        weight = self.cells.weight * (2 / 255)
+        bias = self.cells.bias - self.cells.weight.sum(dim=1)
+        return functional.linear(cells.to(dtype), weight.to(dtype), bias.to(dtype))
 
 
 def _normed(maps: Tensor) -> Tensor:

@@ -107,11 +107,21 @@ class Replay:
         """Return the rows that come next [N]."""
         return (rows + 1) % self.capacity
 
-    def read(self, name: str, rows: Tensor, frames: int | None = None) -> Tensor:
-        """Return entries of rows [N, ...], or the last S up to each [N, S, ...].
+    def read(
+        self,
+        name: str,
+        rows: Tensor,
+        *,
+        frames: int | None = None,
+        column: Tensor | None = None,
+    ) -> Tensor:
+        """Return entries of rows [N, ...].
 
-        Before an episode's first row there is nothing: the first fills the stack.
+        `column` takes one of each row [N]. `frames` returns the last S up to each row
+        [N, S, ...]; before an episode there is nothing: its first row fills the stack.
         """
+        if column is not None:
+            return self._rows[name][rows, column]
         if frames is None:
             return self._rows[name].index_select(0, rows)
         back = torch.arange(frames).minimum(self._rows[AGE][rows][:, None])  # [N, S]
@@ -146,3 +156,5 @@ class Replay:
             kind = getattr(torch, dtype.removeprefix("torch."))
             self._rows[name] = self._room(name, kind, torch.Size(shape))
         self.written, self.episodes = written, episodes
+        # Rows of a later time than the checkpoint's would pass for those to come.
+        self._rows[EPISODE][self._rows[EPISODE] >= episodes] = -1
