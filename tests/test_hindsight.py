@@ -92,9 +92,7 @@ def test_an_episode_is_judged_as_the_env_judged_it(task) -> None:
     )
     base, generator = env.unwrapped, torch.Generator().manual_seed(0)
     config = CONFIGS["listen"]
-    hindsight = Hindsight.of(
-        type(config)(**{**vars(config), "env_id": task}), others=4
-    )
+    hindsight = Hindsight.of(type(config)(**{**vars(config), "env_id": task}), others=4)
     assert hindsight.weights.equal(RewardWeights().vector())
     touched = 0
     for seed in range(3):

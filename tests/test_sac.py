@@ -3,9 +3,9 @@ from functools import partial
 
 import pytest
 import torch
-from toy_envs import HANDS, LENGTH, TASK, ToyVectorEnv, toy_sac
 from torch.distributions import Normal, TanhTransform, TransformedDistribution
 from torch.nn import functional
+from toy_envs import HANDS, LENGTH, TASK, ToyVectorEnv, toy_sac
 
 from ir_maniskill.agent.actor import Squashed
 from ir_maniskill.agent.cell_vision import CameraCells, cells
@@ -28,7 +28,9 @@ def learn(out, steps, **changes):
     envs = ToyVectorEnv(snapshots=True)
     config = toy_sac(out, total_steps=steps, **changes)
     algorithm = partial(SAC, hindsight=hindsight())
-    return run(config, envs=envs, eval_envs=ToyVectorEnv(snapshots=True), algorithm=algorithm)
+    return run(
+        config, envs=envs, eval_envs=ToyVectorEnv(snapshots=True), algorithm=algorithm
+    )
 
 
 # -- Parts -----------------------------------------------------------------------------

@@ -10,8 +10,8 @@ from ir_maniskill.agent import StateSpec
 from ir_maniskill.environment.senses import text_of, tokens_of
 from ir_maniskill.experiment import Experiment, TouchObject
 from ir_maniskill.goals import Instruction, Ref, Touch
-from ir_maniskill.snapshot import Snapshot
 from ir_maniskill.language.tokens import VOCABULARY
+from ir_maniskill.snapshot import Snapshot
 from ir_maniskill.training.config import (
     AgentConfig,
     PPOConfig,
@@ -146,7 +146,6 @@ class ToyVectorEnv:
             cameras = ("top_camera", "front_camera")
             obs["sensor_data"] = {name: {"rgb": image.clone()} for name in cameras}
         return obs
-
 
     def _snapshot(self):
         n, side = self.num_envs, self.joints[:, :1]

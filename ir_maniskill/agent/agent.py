@@ -7,10 +7,9 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.distributions import Normal
 
 from ir_maniskill.agent import cell_vision, language_system
-from ir_maniskill.agent.actor import Actor, Squashed, SquashedActor, tanh_layers
+from ir_maniskill.agent.actor import Actor, SquashedActor, tanh_layers
 from ir_maniskill.agent.alignment import Alignment
 from ir_maniskill.agent.cell_vision import CellVision
 from ir_maniskill.agent.config import AgentConfig
@@ -25,7 +24,6 @@ from ir_maniskill.agent.perceptual_system import (
 from ir_maniskill.checks import require
 from ir_maniskill.environment.senses import State, askable
 from ir_maniskill.environment.senses import entries as entries_of
-
 
 READING_WIDTH = 64
 """Units that G_t is brought to where vision is "cells"."""
@@ -173,7 +171,7 @@ class Agent(nn.Module):
         self.config, self.spec = config, spec
         self.encoder = StateEncoder(config, spec, config.senses)
         width, gain = self.encoder.width, config.posture_gain
-        self.actor: Actor | SquashedActor
+        self.actor: Any  # an algorithm knows which of them it trains
         if config.actor == "squashed":
             self.actor = SquashedActor(width, config.hidden, spec.actions)
         else:
@@ -245,7 +243,8 @@ class Agent(nn.Module):
             if encoder is not None and encoder.standardize is not None:
                 encoder.standardize.update(privileged)
 
-    def _distribution(self, state: State, aligned: Tensor) -> Normal | Squashed:
+    def _distribution(self, state: State, aligned: Tensor) -> Any:
+        """Return a `Normal`, or what is `Squashed`."""
         if isinstance(self.actor, SquashedActor):
             return self.actor(aligned)
         return self.actor(aligned, state["target"][:, 0])

@@ -28,6 +28,16 @@ def cells(images: Tensor) -> Tensor:
     return words.permute(2, 0, 3, 5, 1, 4, 6).flatten(4).contiguous().view(torch.uint8)
 
 
+class Convolution(nn.Conv2d):
+    """One that computes in the numbers it is given, whatever its weights are."""
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """Return the convolved maps [N, C, H, W]."""
+        assert self.bias is not None
+        weight, bias = self.weight.to(maps.dtype), self.bias.to(maps.dtype)
+        return self._conv_forward(maps, weight, bias)
+
+
 class CameraCells(nn.Module):
     """Feature maps of one camera: cells, then convolutions, as the sentence asks."""
 
@@ -36,7 +46,7 @@ class CameraCells(nn.Module):
         super().__init__()
         self.cells = nn.Linear(3 * frames * CELL**2, CHANNELS)
         self.convolutions = nn.ModuleList(
-            nn.Conv2d(CHANNELS, CHANNELS, 3, stride=stride, padding=1)
+            Convolution(CHANNELS, CHANNELS, 3, stride=stride, padding=1)
             for stride in (2, 1)
         )
         self.films = nn.ModuleList(FiLM(film_width, CHANNELS) for _ in range(2))
@@ -45,13 +55,7 @@ class CameraCells(nn.Module):
         """Return the flat maps [N, D] of the cells [N, H, W, S * 48]."""
         maps = _normed(self.read(cells, dtype))
         for convolve, film in zip(self.convolutions, self.films, strict=True):
-            maps = functional.conv2d(
-                maps.permute(0, 3, 1, 2),  # channels stay last in memory
-                convolve.weight.to(dtype),
-                convolve.bias.to(dtype),
-                stride=convolve.stride,
-                padding=convolve.padding,
-            )
+            maps = convolve(maps.permute(0, 3, 1, 2))  # in memory, channels stay last
             maps = film(maps, language).permute(0, 2, 3, 1)
             maps = _normed(maps)
         return maps.flatten(1)

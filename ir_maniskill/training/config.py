@@ -76,7 +76,7 @@ class PPOConfig:
 
 @dataclass(frozen=True)
 class SACConfig:
-    """Soft actor-critic with hindsight: what is tried is judged under many sentences."""
+    """Soft actor-critic with hindsight: episodes are judged under many sentences."""
 
     capacity: int = 150_000
     """Steps that the replay has room for; the oldest make room."""
@@ -164,8 +164,8 @@ class TrainConfig:
     agent: AgentConfig = field(default_factory=lambda: AgentConfig(posture_gain=1.0))
     """The learner."""
     algorithm: AlgorithmName = "ppo"
-    """How it learns: the paper's proximal policy optimization, or soft actor-critic with
-    hindsight."""
+    """How it learns: the paper's proximal policy optimization, or soft actor-critic
+    with hindsight."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """Of the former."""
     sac: SACConfig = field(default_factory=SACConfig)
@@ -185,7 +185,7 @@ class TrainConfig:
         require(fits, "posture_gain", gain, expected)
         agent, sac = self.agent, self.algorithm == "sac"
         fits = (agent.actor == "squashed", agent.critic == "none") == (sac, sac)
-        expected = "'squashed' and 'none' with algorithm 'sac', others with 'ppo'"
+        expected = "'squashed' and 'none' with 'sac', others with 'ppo'"
         require(fits, "actor and critic", (agent.actor, agent.critic), expected)
         fits = not (sac and "state" in (agent.senses or ()))
         require(fits, "senses", agent.senses, "no 'state', which tells one sentence's")
@@ -284,9 +284,8 @@ CONFIGS: dict[str, TrainConfig] = {
         ),
     ),
 }
-"""The named configurations: "default" for all that feel their joints, "listen" for
-many sentences (the second algorithm), "vision" for pictures alone, "paper" as published;
-all run the same code."""
+"""The named configurations: "default" for all that feel their joints, "vision" for
+pictures alone, "paper" as published, "listen" for many sentences, by hindsight."""
 
 
 # -- Files -----------------------------------------------------------------------------

@@ -75,7 +75,9 @@ class Hindsight:
         }
         listed = experiment.instructions
         self._listed = () if isinstance(listed, Spoken) else listed
-        self.sentences = 1 + min(others, len(self._listed) - 1 if self._listed else others)
+        self.sentences = 1 + min(
+            others, len(self._listed) - 1 if self._listed else others
+        )
         """M."""
 
     @classmethod

@@ -18,11 +18,11 @@ Rows = dict[str, Tensor]
 """Tensors by name [N, ...]."""
 
 EPISODE, AGE = "replay.episode", "replay.age"
-"""Of each row: the number of its episode (-1: being written), and its step in that."""
+"""Of each row: its episode's number (-1: being written), and which step of that."""
 
 
 class Replay:
-    """Rows in a ring of limited size, in memory or in files that outlive the process."""
+    """Rows in a ring of limited size: in memory, or in files that outlive it."""
 
     def __init__(self, capacity: int) -> None:
         """Have room for that many rows, once it is known what is in one."""
@@ -77,7 +77,9 @@ class Replay:
         layout |= {name: (torch.int64, torch.Size()) for name in (EPISODE, AGE)}
         if self._folder is not None:
             self._folder.mkdir(parents=True, exist_ok=True)
-            shapes = {k: [str(dtype), list(shape)] for k, (dtype, shape) in layout.items()}
+            shapes = {
+                k: [str(dtype), list(shape)] for k, (dtype, shape) in layout.items()
+            }
             text = json.dumps({"capacity": self.capacity, "rows": shapes})
             (self._folder / "layout.json").write_text(text)
         for name, (dtype, shape) in layout.items():

@@ -18,8 +18,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ir_maniskill.agent.agent import Agent
-from ir_maniskill.environment.senses import State, StateStack
 from ir_maniskill.environment.process_vector import ProcessVectorEnv, Step
+from ir_maniskill.environment.senses import State, StateStack
 from ir_maniskill.environment.vector import VectorEnv, info_of_step
 from ir_maniskill.evaluation.evaluate import EvaluationReport, evaluate_policy, threads
 from ir_maniskill.training import checkpoint, distributed
@@ -117,7 +117,9 @@ class Runner:
         self.seconds["collect"] -= self.seconds["update"]
         means, self.counts = self.counts.means(), StepCounts()
         figures = {f"train/{k}": v for k, v in means.items()} | figures
-        figures |= {f"time/{name}": value for name, value in self.seconds.items()}  # [s]
+        figures |= {
+            f"time/{name}": value for name, value in self.seconds.items()
+        }  # [s]
         if distributed.rank() == 0:
             self.folder.log("metrics", self.steps, figures)
         return figures

@@ -9,6 +9,7 @@ Legend: N envs, B steps of a batch, A numbers of an action, D numbers a critic r
 from __future__ import annotations
 
 import copy
+import itertools
 import logging
 import math
 from collections import defaultdict
@@ -55,7 +56,7 @@ class Critics(nn.Module):
         """Make the layers for D + A numbers."""
         super().__init__()
         widths = (inputs, *WIDTHS, 1)
-        pairs = list(zip(widths, widths[1:], strict=False))
+        pairs = list(itertools.pairwise(widths))
         bound = [1 / math.sqrt(into) for into, _ in pairs]
         self.weights = nn.ParameterList(
             torch.empty(2, *pair).uniform_(-b, b)
@@ -78,7 +79,7 @@ class Critics(nn.Module):
 
 
 class SAC(Algorithm):
-    """Keeps every episode, and learns from steps of all of them under many sentences."""
+    """Keeps all episodes, and learns from their steps under many sentences."""
 
     learns_while_stepping = True
 
@@ -118,7 +119,10 @@ class SAC(Algorithm):
         self.replay = Replay(config.sac.capacity)
         self.actions, self.updates = actions, 0
         self._history: dict[str, list[Tensor]] = defaultdict(list)
-        self.restart()
+        self._past: list[State] = []
+        """Steps of all envs whose episodes go on, the oldest first."""
+        self._began = torch.zeros(len(state["instruction"]), dtype=torch.int64)
+        """Of each env, which of them its episode began with."""
 
     def _adam(self, weights: Iterable[Tensor]) -> torch.optim.Adam:
         return torch.optim.Adam(list(weights), self.config.learning_rate, fused=True)
@@ -143,20 +147,15 @@ class SAC(Algorithm):
             action = torch.rand(count, self.actions) * 2 - 1
         else:
             action, _ = self.agent.actor(self.agent.encoder(state)).rsample()
-        if not self._past:
-            self._began = torch.zeros(count, dtype=torch.int64)
         self._past.append({**self._kept(state), "action": action})
         return action
 
     def _kept(self, state: State) -> State:
         """Return what of a state is kept: of stacks the newest alone."""
-        sensed = {name: state[name][:, 0] for name in self.agent.encoder.sensed}
-        always = ("proprioception", "target", "joint_velocity", "snapshot", "text")
-        every = {
-            name: state[name][:, 0] if name in ("proprioception", "target") else state[name]
-            for name in always
-        }
-        return {**sensed, **every}
+        stacked = {*self.agent.encoder.sensed, "proprioception", "target"}
+        newest = {name: state[name][:, 0] for name in stacked}
+        once = ("joint_velocity", "snapshot", "text")
+        return newest | {name: state[name] for name in once}
 
     def observe(self, outcome: Outcome) -> None:
         """Judge and keep the episodes that ended."""
@@ -166,7 +165,7 @@ class SAC(Algorithm):
         assert outcome.final is not None
         final = self._kept(outcome.final)
         for env in ended:
-            rows = [step for step in self._past[int(self._began[env]) :]]
+            rows = self._past[int(self._began[env]) :]
             episode = {
                 name: torch.stack([*(row[name][env] for row in rows), value[env]])
                 for name, value in final.items()
@@ -177,16 +176,21 @@ class SAC(Algorithm):
             terminal[-1] = outcome.terminated[env]
             self._keep({**episode, "terminal": terminal})
         self._began[ended] = len(self._past)
-        if int(self._began.min()) == len(self._past):
-            self._past = []
+        oldest = int(self._began.min())
+        self._past, self._began = self._past[oldest:], self._began - oldest
 
     def _keep(self, episode: State) -> None:
         """Judge an episode under several sentences, and add it to the replay."""
         scenes = Snapshot.unpack(episode["snapshot"], self.hindsight.fingers)
         (said,) = read_text(episode.pop("text")[:1])
-        found = self.hindsight.find(scenes.rows(torch.zeros(1, dtype=torch.int64)), said)
+        found = self.hindsight.find(
+            scenes.rows(torch.zeros(1, dtype=torch.int64)), said
+        )
         judged = self.hindsight.judge(scenes, found)
-        rows, sentences = len(scenes.contact), self.hindsight.read(found, self._sentence)
+        rows, sentences = (
+            len(scenes.contact),
+            self.hindsight.read(found, self._sentence),
+        )
         first = not len(self.replay)
         self.replay.add(
             episode
@@ -200,7 +204,7 @@ class SAC(Algorithm):
 
     def restart(self) -> None:
         """Forget the episodes that were not seen to end."""
-        self._past: list[State] = []
+        self._past, self._began = [], torch.zeros_like(self._began)
 
     # -- Learning --------------------------------------------------------------------
 
@@ -246,6 +250,8 @@ class SAC(Algorithm):
         read = {name: replay.read(name, rows, frames=frames) for name in sensed}
         for name in self._sentence:
             sentence = replay.read(name, rows, column=which)
+            longest = int((sentence != 0).any(dim=0).sum())  # what follows is padding
+            sentence = sentence[:, :longest]
             read[name] = sentence.long() if name == "instruction" else sentence
         for name in ("proprioception", "target"):
             read[f"now.{name}"] = replay.read(name, rows)
