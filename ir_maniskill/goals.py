@@ -284,6 +284,8 @@ class Push(Goal):
 
     STRAIGHT = 0.6
     """Largest share of the way that it may stray to the side."""
+    LEVEL = 3.0
+    """Level of a whole push: that of a touch with all fingers of one hand of NAO."""
     BEHIND = 0.04
     """How far behind its center fingers should be to push it [m]."""
 
@@ -302,7 +304,7 @@ class Push(Goal):
         holds = (along >= asked.distance) & (aside <= Push.STRAIGHT * along)
         strayed = (aside - Push.STRAIGHT * along.clamp(min=0)).clamp(min=0)
         gap = ((asked.distance - along).clamp(min=0) + strayed).masked_fill(holds, 0.0)
-        progress = (along / asked.distance).clamp(-1, 1)
+        progress = Push.LEVEL * (along / asked.distance).clamp(-1, 1)
         serves = asked.ref[:, None].expand_as(scene.contact)
         behind = -Push.BEHIND * asked.ref[..., None] * asked.direction[:, None]
         return Measure(
@@ -334,6 +336,9 @@ class Avoid(Goal):
 class Both(Goal):
     """Two goals at the same time."""
 
+    HALF = 0.25
+    """What is left of its level while one of them is not reached."""
+
     a: Goal
     """The one."""
     b: Goal
@@ -348,12 +353,13 @@ class Both(Goal):
     def measure(scene: Snapshot, asked: SimpleNamespace) -> Measure:
         """Hold where both do; contacts serve that serve either."""
         a, b = asked.a.measure(scene), asked.b.measure(scene)
+        holds = a.holds & b.holds
         return Measure(
-            holds=a.holds & b.holds,
+            holds=holds,
             gap=torch.maximum(a.gap, b.gap),
             serves=a.serves | b.serves,
             bars=a.bars | b.bars,
-            level=a.level + b.level,
+            level=(a.level + b.level) * torch.where(holds, 1.0, Both.HALF),
             still=a.still | b.still,
             may_move=a.may_move | b.may_move,
             aim=a.aim + b.aim,

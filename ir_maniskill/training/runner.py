@@ -22,6 +22,7 @@ from ir_maniskill.environment.process_vector import ProcessVectorEnv, Step
 from ir_maniskill.environment.senses import State, StateStack
 from ir_maniskill.environment.vector import VectorEnv, info_of_step
 from ir_maniskill.evaluation.evaluate import EvaluationReport, evaluate_policy, threads
+from ir_maniskill.language import KINDS
 from ir_maniskill.training import checkpoint, distributed
 from ir_maniskill.training.algorithm import Algorithm, Outcome
 from ir_maniskill.training.checkpoint import CheckpointError, Stored
@@ -117,9 +118,7 @@ class Runner:
         self.seconds["collect"] -= self.seconds["update"]
         means, self.counts = self.counts.means(), StepCounts()
         figures = {f"train/{k}": v for k, v in means.items()} | figures
-        figures |= {
-            f"time/{name}": value for name, value in self.seconds.items()
-        }  # [s]
+        figures |= {f"time/{k}": v for k, v in self.seconds.items()}  # [s]
         if distributed.rank() == 0:
             self.folder.log("metrics", self.steps, figures)
         return figures
@@ -362,7 +361,11 @@ def figures_of(report: EvaluationReport) -> Figures:
     names = ("success", "exclusive", "holding", "right_fingers", "wrong_fingers")
     overall = report.overall.as_dict()
     worst = min(score.success.value for score in report.instructions.values())
-    return {"eval/worst": worst} | {f"eval/{name}": overall[name] for name in names}
+    figures = {"eval/worst": worst} | {f"eval/{name}": overall[name] for name in names}
+    for name, score in report.instructions.items():
+        if name in KINDS:
+            figures[f"eval/{name}"] = score.exclusive.value
+    return figures
 
 
 SHOWN = {

@@ -250,8 +250,6 @@ class SAC(Algorithm):
         read = {name: replay.read(name, rows, frames=frames) for name in sensed}
         for name in self._sentence:
             sentence = replay.read(name, rows, column=which)
-            longest = int((sentence != 0).any(dim=0).sum())  # what follows is padding
-            sentence = sentence[:, :longest]
             read[name] = sentence.long() if name == "instruction" else sentence
         for name in ("proprioception", "target"):
             read[f"now.{name}"] = replay.read(name, rows)
