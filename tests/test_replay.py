@@ -23,6 +23,12 @@ def test_steps_are_drawn_of_every_row_but_the_last_of_an_episode() -> None:
     assert set(pairs) == {(0, 1), (1, 2), (10, 11)}
 
 
+def test_nothing_follows_the_last_row_of_the_only_episode() -> None:
+    replay = Replay(20)
+    replay.add(episode(0, 3))
+    assert set(replay.draw(100).tolist()) == {0, 1}
+
+
 def test_the_oldest_rows_make_room_and_episodes_go_round_the_end() -> None:
     replay = Replay(7)
     for first in (0, 10, 20):  # 20, 21, 22 are in rows 6, 0, 1

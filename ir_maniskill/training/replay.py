@@ -84,6 +84,7 @@ class Replay:
             (self._folder / "layout.json").write_text(text)
         for name, (dtype, shape) in layout.items():
             self._rows[name] = self._room(name, dtype, shape)
+        self._rows[EPISODE].fill_(-1)
 
     def _room(self, name: str, dtype: torch.dtype, shape: torch.Size) -> Tensor:
         size = self.capacity * math.prod(shape)
