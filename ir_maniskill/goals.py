@@ -176,6 +176,9 @@ class Measure:
     """Objects whose motion the dense reward penalizes [N, C] bool; None: none."""
     may_move: Tensor = None  # type: ignore[assignment]
     """Objects that may be moved; moving others is a foul [N, C] bool; None: all."""
+    aim: Tensor = None  # type: ignore[assignment]
+    """Where fingertips should be to serve it, from each object's center [N, C, 3] [m];
+    None: at it."""
     stage: Tensor = None  # type: ignore[assignment]
     """How many goals of a sequence `Then` are reached [N] int64; None: 0."""
 
@@ -186,6 +189,7 @@ class Measure:
             "level": self.holds.float,
             "still": lambda: torch.zeros_like(objects),
             "may_move": lambda: torch.ones_like(objects),
+            "aim": lambda: objects[..., None] * torch.zeros(3, device=objects.device),
             "stage": lambda: torch.zeros_like(self.holds, dtype=torch.int64),
         }
         for name, make in defaults.items():
@@ -280,6 +284,10 @@ class Push(Goal):
 
     STRAIGHT = 0.6
     """Largest share of the way that it may stray to the side."""
+    LEVEL = 3.0
+    """Level of a whole push: that of a touch with all fingers of one hand of NAO."""
+    BEHIND = 0.04
+    """How far behind its center fingers should be to push it [m]."""
 
     def __post_init__(self) -> None:
         self._check(ref=Ref, distance=Real)
@@ -296,9 +304,12 @@ class Push(Goal):
         holds = (along >= asked.distance) & (aside <= Push.STRAIGHT * along)
         strayed = (aside - Push.STRAIGHT * along.clamp(min=0)).clamp(min=0)
         gap = ((asked.distance - along).clamp(min=0) + strayed).masked_fill(holds, 0.0)
-        progress = (along / asked.distance).clamp(-1, 1)
+        progress = Push.LEVEL * (along / asked.distance).clamp(-1, 1)
         serves = asked.ref[:, None].expand_as(scene.contact)
-        return Measure(holds, gap, serves, level=progress, may_move=asked.ref)
+        behind = -Push.BEHIND * asked.ref[..., None] * asked.direction[:, None]
+        return Measure(
+            *(holds, gap, serves), level=progress, may_move=asked.ref, aim=behind
+        )
 
 
 @dataclass(frozen=True)
@@ -325,6 +336,9 @@ class Avoid(Goal):
 class Both(Goal):
     """Two goals at the same time."""
 
+    HALF = 0.25
+    """What is left of its level while one of them is not reached."""
+
     a: Goal
     """The one."""
     b: Goal
@@ -339,14 +353,16 @@ class Both(Goal):
     def measure(scene: Snapshot, asked: SimpleNamespace) -> Measure:
         """Hold where both do; contacts serve that serve either."""
         a, b = asked.a.measure(scene), asked.b.measure(scene)
+        holds = a.holds & b.holds
         return Measure(
-            holds=a.holds & b.holds,
+            holds=holds,
             gap=torch.maximum(a.gap, b.gap),
             serves=a.serves | b.serves,
             bars=a.bars | b.bars,
-            level=a.level + b.level,
+            level=(a.level + b.level) * torch.where(holds, 1.0, Both.HALF),
             still=a.still | b.still,
             may_move=a.may_move | b.may_move,
+            aim=a.aim + b.aim,
         )
 
 

@@ -7,8 +7,10 @@ Legend: N envs, F fingers, C objects.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
 
@@ -47,8 +49,45 @@ class Snapshot:
     @property
     def distance(self) -> Tensor:
         """From each fingertip to each object's center [N, F, C] [m]."""
-        return (self.fingertip[:, :, None] - self.position[:, None]).norm(dim=-1)
+        return self.to_object.norm(dim=-1)
+
+    @property
+    def to_object(self) -> Tensor:
+        """From each object's center to each fingertip [N, F, C, 3] [m]."""
+        return self.fingertip[:, :, None] - self.position[:, None]
+
+    def rows(self, index: Tensor) -> Snapshot:
+        """Return some of the scenes [M], each as often as its row is named."""
+        return Snapshot(*(part[index] for part in vars(self).values()))
 
     def at_stage(self, stage: Tensor) -> Snapshot:
         """Return the same scenes at another stage of their goals [N] int64."""
         return replace(self, stage=stage)
+
+    def pack(self) -> Tensor:
+        """Return all of it as one row of numbers per env [N, P] float32."""
+        parts = [part.reshape(len(part), -1) for part in vars(self).values()]
+        return torch.cat([part.float() for part in parts], dim=1)
+
+    @classmethod
+    def unpack(cls, rows: Tensor, fingers: int) -> Snapshot:
+        """Return what `pack` made of scenes with F fingers [..., P] -> [..., F, C]."""
+        # P = F C + 3 F + 19 C + 1: contact, fingertip, all that objects have, stage
+        objects = (rows.shape[-1] - 3 * fingers - 1) // (fingers + 19)
+        shapes = {
+            "contact": (fingers, objects),
+            "fingertip": (fingers, 3),
+            "pose": (objects, 7),
+            "start": (objects, 7),
+            "velocity": (objects, 3),
+            "color": (objects,),
+            "shape": (objects,),
+            "stage": (),
+        }
+        sizes = [math.prod(shape) for shape in shapes.values()]
+        parts = zip(shapes.items(), rows.split(sizes, dim=-1), strict=True)
+        fields = {k: v.reshape(*rows.shape[:-1], *shape) for (k, shape), v in parts}
+        fields["contact"] = fields["contact"] > 0
+        for name in ("color", "shape", "stage"):
+            fields[name] = fields[name].long()
+        return cls(**fields)

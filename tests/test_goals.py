@@ -109,11 +109,11 @@ def test_with_the_other_hand_a_touch_is_a_foul():
 @pytest.mark.parametrize(
     ("moved", "holds", "gap", "level"),
     [
-        ((0.0, 0.051, 0.0), True, 0.0, 1.0),
-        ((0.0, 0.02, 0.0), False, 0.03, 0.4),
-        ((0.0, -0.1, 0.0), False, 0.15, -1.0),
-        ((0.04, 0.051, 0.0), False, 0.0094, 1.0),  # strays by 4 cm, may by 3.06
-        ((0.0, 0.051, -0.3), True, 0.0, 1.0),  # a fall from the table is not sideways
+        ((0.0, 0.051, 0.0), True, 0.0, 3.0),
+        ((0.0, 0.02, 0.0), False, 0.03, 1.2),
+        ((0.0, -0.1, 0.0), False, 0.15, -3.0),
+        ((0.04, 0.051, 0.0), False, 0.0094, 3.0),  # strays by 4 cm, may by 3.06
+        ((0.0, 0.051, -0.3), True, 0.0, 3.0),  # a fall from the table is not sideways
     ],
 )
 def test_push_measures_the_way_along_and_to_the_side(moved, holds, gap, level):
@@ -140,6 +140,8 @@ def test_avoid_bars_its_object_alone():
 def test_both_holds_where_both_do_and_allows_what_either_needs():
     goal = Both(Touch(RED, "left"), Touch(BLUE, "right"))
     assert outcome(goal, scene((0, 1), (3, 0))) == (True, 0.0, False)
+    assert measured(goal, scene((0, 1), (3, 0)))[0].level.item() == 2
+    assert measured(goal, scene((0, 1), (1, 1)))[0].level.item() == 0.5
     holds, gap, foul = outcome(goal, scene((0, 1)))
     assert (holds, foul) == (False, False)
     assert gap == pytest.approx((0.19**2 + 0.05**2) ** 0.5)

@@ -7,8 +7,17 @@ import torch
 from gymnasium.spaces import Box
 
 from ir_maniskill.agent import StateSpec
+from ir_maniskill.environment.senses import text_of, tokens_of
+from ir_maniskill.experiment import Experiment, TouchObject
+from ir_maniskill.goals import Instruction, Ref, Touch
 from ir_maniskill.language.tokens import VOCABULARY
-from ir_maniskill.training.config import AgentConfig, PPOConfig, TrainConfig
+from ir_maniskill.snapshot import Snapshot
+from ir_maniskill.training.config import (
+    AgentConfig,
+    PPOConfig,
+    SACConfig,
+    TrainConfig,
+)
 
 LENGTH = 8  # steps of an episode
 JOINTS, FINGERS = 2, 2
@@ -28,6 +37,18 @@ def toy_state(n=3):
     }
 
 
+TASK = Experiment(
+    "ToyTouch-v1",
+    (TouchObject("blue", (0.2, 0.06)), TouchObject("red", (0.2, -0.06))),
+    (
+        Instruction(SENTENCES[0], Touch(Ref("red"))),
+        Instruction(SENTENCES[1], Touch(Ref("blue"))),
+    ),
+    vocabulary=(*VOCABULARY[:3], "go", "left", "right"),
+)
+"""The same as goals: joint 0 moves two fingers 6 cm to either side of the middle."""
+HANDS = {"left": ("a",), "right": ("b",)}
+
 SPEC = StateSpec.of(toy_state(), JOINTS)
 """Shapes of `toy_state`, and of a toy agent that reads and does as much."""
 
@@ -38,8 +59,8 @@ class ToyVectorEnv:
     It offers what `make_vec` promises: same-step reset, final observation and info.
     """
 
-    def __init__(self, num_envs=8, images=False, env_id="Toy-v1"):
-        self.num_envs, self.images = num_envs, images
+    def __init__(self, num_envs=8, images=False, env_id="Toy-v1", snapshots=False):
+        self.num_envs, self.images, self.snapshots = num_envs, images, snapshots
         self.device = torch.device("cpu")
         self.single_action_space = Box(-1, 1, (JOINTS,))
         senses = ("vision", "proprioception") if images else ("proprioception",)
@@ -113,12 +134,50 @@ class ToyVectorEnv:
                 "wrong_once": torch.zeros(self.num_envs, 1),
             },
         }
+        if self.snapshots:
+            tokens = tokens_of(SENTENCES, TASK.vocabulary, 3)
+            obs["extra"]["instruction"] = tokens[self.told]
+            obs["extra"]["snapshot"] = self._snapshot().pack()
+            obs["extra"]["joint_velocity"] = torch.zeros_like(self.joints)
+            obs["extra"]["text"] = text_of([SENTENCES[i] for i in self.told])
         if self.images:
             brightness = (100 * (self.joints[:, 0] + 1)).byte()
             image = brightness[:, None, None, None].repeat(1, 16, 8, 3)
             cameras = ("top_camera", "front_camera")
             obs["sensor_data"] = {name: {"rgb": image.clone()} for name in cameras}
         return obs
+
+    def _snapshot(self):
+        n, side = self.num_envs, self.joints[:, :1]
+        near = (side - GOALS.flip(0)).abs() < 0.2  # [N, 2]: blue is on the right
+        pose = torch.zeros(n, 2, 7)
+        pose[..., 1] = 0.1 * GOALS.flip(0)
+        fingertip = torch.zeros(n, FINGERS, 3)
+        fingertip[..., 1] = 0.1 * side
+        return Snapshot(
+            contact=near[:, None].repeat(1, FINGERS, 1),
+            fingertip=fingertip,
+            pose=pose,
+            start=pose,
+            velocity=torch.zeros(n, 2, 3),
+            color=torch.tensor([[0, 1]] * n),
+            shape=torch.zeros(n, 2, dtype=torch.long),
+            stage=torch.zeros(n, dtype=torch.long),
+        )
+
+
+def toy_sac(out, **changes):
+    """Return a config with which the other algorithm learns the toy task in seconds."""
+    agent = AgentConfig(
+        senses=("proprioception", "target"),
+        hidden=(32, 32),
+        vision="cells",
+        actor="squashed",
+        critic="none",
+    )
+    learner = SACConfig(capacity=2000, random_steps=64, first_steps=128, batch=64)
+    values = {"algorithm": "sac", "frames": 1, "agent": agent, "sac": learner}
+    return toy_config(out, **(values | {"ppo": PPOConfig()} | changes))
 
 
 def toy_config(out, **changes):

@@ -1,11 +1,14 @@
 """Actor: from B_t to the action a_t."""
 
+import itertools
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.distributions import Normal
+from torch.nn import functional
 
 
 def tanh_layers(
@@ -56,3 +59,50 @@ class Actor(nn.Module):
     def set_std(self, std: float) -> None:
         """Set the deviation of every action (a schedule's)."""
         self.log_std.data.fill_(math.log(std))
+
+
+class Squashed(NamedTuple):
+    """A Gaussian put through tanh: actions that stay in [-1, 1] by themselves."""
+
+    center: Tensor  # [N, A], before the tanh
+    log_std: Tensor  # [N, A]
+
+    @property
+    def mean(self) -> Tensor:
+        """The action in the middle [N, A]."""
+        return torch.tanh(self.center)
+
+    def rsample(self) -> tuple[Tensor, Tensor]:
+        """Return actions [N, A] through which gradients flow, and log pi(a|s) [N]."""
+        noise = torch.randn_like(self.center)
+        free = self.center + self.log_std.exp() * noise
+        # log N(free) - log |d tanh(free) / d free|, the latter without cancellation
+        density = -0.5 * noise.square() - self.log_std - 0.5 * math.log(2 * math.pi)
+        slope = 2 * (math.log(2) - free - functional.softplus(-2 * free))
+        return torch.tanh(free), (density - slope).sum(-1)
+
+
+def normed_layers(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
+    """Return linear layers, each but the last one normalized and with a ReLU."""
+    widths = (inputs, *hidden)
+    layers: list[nn.Module] = []
+    for into, out in itertools.pairwise(widths):
+        layers += [nn.Linear(into, out), nn.LayerNorm(out), nn.ReLU()]
+    return nn.Sequential(*layers, nn.Linear(widths[-1], outputs))
+
+
+class SquashedActor(nn.Module):
+    """pi(a|s): a Gaussian within [-1, 1] of which both parameters are read from B_t."""
+
+    LOG_STD = (-4.0, 0.5)
+    """Between which the logarithm of the deviation stays."""
+
+    def __init__(self, inputs: int, hidden: Sequence[int], actions: int) -> None:
+        """Make the layers."""
+        super().__init__()
+        self.layers = normed_layers(inputs, hidden, 2 * actions)
+
+    def forward(self, aligned: Tensor) -> Squashed:
+        """Return the distribution of a_t [N, A], of B_t [N, D]."""
+        center, log_std = self.layers(aligned).chunk(2, dim=-1)
+        return Squashed(center, log_std.clamp(*self.LOG_STD))

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.distributions import Normal
 
-from ir_maniskill.agent import language_system
-from ir_maniskill.agent.actor import Actor, tanh_layers
+from ir_maniskill.agent import cell_vision, language_system
+from ir_maniskill.agent.actor import Actor, SquashedActor, tanh_layers
 from ir_maniskill.agent.alignment import Alignment
+from ir_maniskill.agent.cell_vision import CellVision
 from ir_maniskill.agent.config import AgentConfig
 from ir_maniskill.agent.critic import Critic, Standardize
 from ir_maniskill.agent.perceptual_system import (
@@ -24,6 +24,9 @@ from ir_maniskill.agent.perceptual_system import (
 from ir_maniskill.checks import require
 from ir_maniskill.environment.senses import State, askable
 from ir_maniskill.environment.senses import entries as entries_of
+
+READING_WIDTH = 64
+"""Units that G_t is brought to where vision is "cells"."""
 
 
 @dataclass(frozen=True)
@@ -102,30 +105,43 @@ class StateEncoder(nn.Module):
         """Entries of the state that it needs, beside the sentence."""
         self.felt = tuple(name for name in entries if name != "images")
         self.language = language_system.encoder_of(config)(config)
+        self.reading: nn.Module | None = None
+        width = self.language.width
+        if config.vision == "cells":
+            norm = nn.LayerNorm(READING_WIDTH), nn.Tanh()
+            self.reading = nn.Sequential(nn.Linear(width, READING_WIDTH), *norm)
+            width = READING_WIDTH
         self.vision: nn.Module | None = None
         self.standardize: Standardize | None = None
         self.body: BodySense | None = None
         if "images" in entries:
-            self.vision = self._vision(config, spec.shapes["images"])
+            self.vision = self._vision(config, spec.shapes["images"], width)
         if "privileged" in entries:
             self.standardize = Standardize(*spec.shapes["privileged"])
         if self.felt:
             inputs = sum(math.prod(spec.shapes[name]) for name in self.felt)
-            self.body = BodySense(inputs, normalize=config.vision == "patches")
-        self.width = self.language.width  # of B_t
-        self.width += VISION_WIDTH if self.vision is not None else 0
+            self.body = BodySense(inputs, normalize=config.vision != "paper")
+        self.width = width  # of B_t
+        if self.vision is not None:
+            cell = config.vision == "cells"
+            self.width += cell_vision.WIDTH if cell else VISION_WIDTH
         self.width += BODY_WIDTH if self.felt else 0
         self.alignment = Alignment()
 
-    def _vision(self, config: AgentConfig, shape: tuple[int, ...]) -> nn.Module:
+    def _vision(
+        self, config: AgentConfig, shape: tuple[int, ...], film_width: int
+    ) -> nn.Module:
         frames, cameras, height, width, _ = shape
         if config.vision == "paper":
             return PaperVision(frames, cameras)
-        return PatchVision(frames, (cameras, height, width), self.language.width)
+        kind = CellVision if config.vision == "cells" else PatchVision
+        return kind(frames, (cameras, height, width), film_width)
 
     def forward(self, state: State) -> Tensor:
         """Return B_t [N, D] = [G_t, V_t, H_t]."""
         said = self.language(*(state[name] for name in self.language.reads))
+        if self.reading is not None:
+            said = self.reading(said)
         embeddings = [said]
         if self.vision is not None:
             embeddings.append(self.vision(state["images"], said))
@@ -155,12 +171,17 @@ class Agent(nn.Module):
         self.config, self.spec = config, spec
         self.encoder = StateEncoder(config, spec, config.senses)
         width, gain = self.encoder.width, config.posture_gain
-        self.actor = Actor(width, config.hidden, spec.actions, posture_gain=gain)
+        self.actor: Any  # an algorithm knows which of them it trains
+        if config.actor == "squashed":
+            self.actor = SquashedActor(width, config.hidden, spec.actions)
+        else:
+            self.actor = Actor(width, config.hidden, spec.actions, posture_gain=gain)
         self.critic_encoder: StateEncoder | None = None
         self.critic: Critic | None = None
         self.locator: nn.Sequential | None = None
         if not policy_only:
-            self._make_critic(config, spec)
+            if config.critic != "none":
+                self._make_critic(config, spec)
             if config.auxiliary_weight > 0:
                 self.locator = tanh_layers(width, (128,), 3, gain=0.1)
 
@@ -192,7 +213,7 @@ class Agent(nn.Module):
     def policy(self, state: State) -> Tensor:
         """Return the policy's mean action [N, A] in [-1, 1], without any noise."""
         self.spec.require(state, self.encoder.sensed)
-        device = self.actor.log_std.device
+        device = next(self.actor.parameters()).device
         here = {key: value.to(device) for key, value in state.items()}
         return self._distribution(here, self.encoder(here)).mean.clamp(-1, 1)
 
@@ -222,5 +243,8 @@ class Agent(nn.Module):
             if encoder is not None and encoder.standardize is not None:
                 encoder.standardize.update(privileged)
 
-    def _distribution(self, state: State, aligned: Tensor) -> Normal:
+    def _distribution(self, state: State, aligned: Tensor) -> Any:
+        """Return a `Normal`, or what is `Squashed`."""
+        if isinstance(self.actor, SquashedActor):
+            return self.actor(aligned)
         return self.actor(aligned, state["target"][:, 0])

@@ -28,5 +28,6 @@ class FiLM(nn.Module):
 
     def forward(self, maps: Tensor, language: Tensor) -> Tensor:
         """Return the maps [N, C, H, W] modulated by G_t [N, D]."""
-        scale, shift = self.scale_and_shift(language)[..., None, None].chunk(2, dim=1)
+        said = self.scale_and_shift(language).to(maps.dtype)[..., None, None]
+        scale, shift = said.chunk(2, dim=1)
         return torch.addcmul(maps + shift, maps, scale)

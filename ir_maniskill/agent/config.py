@@ -8,8 +8,9 @@ from ir_maniskill.checks import require, require_choices, require_fields
 from ir_maniskill.environment.senses import available
 from ir_maniskill.language.tokens import VOCABULARY
 
-Vision = Literal["patches", "paper"]
-CriticInput = Literal["asymmetric", "separate"]
+Vision = Literal["patches", "paper", "cells"]
+ActorKind = Literal["gaussian", "squashed"]
+CriticInput = Literal["asymmetric", "separate", "none"]
 
 CONSTANT = {
     "language_layers": 3,
@@ -40,7 +41,11 @@ class AgentConfig:
     vision: Vision = "patches"
     """"paper": two 5x5 convolutions over the cameras side by side; "patches": a
     convolution over 4x4 patches of each camera, then 3x3 ones, all normalized, and
-    so is H_t then; the sentence modulates them (FiLM)."""
+    so is H_t then; the sentence modulates them (FiLM); "cells": much the same, made for
+    learning from a replay, and G_t is brought to 64 units."""
+    actor: ActorKind = "gaussian"
+    """"gaussian": a deviation that a schedule sets; "squashed": one that is read from
+    the state, and a tanh that keeps actions within [-1, 1]."""
     posture_gain: float = 0.0
     """How strongly mean actions, changes of the joint targets, draw these toward the
     posture that the actor's layers then give (it then knows the targets, whatever its
@@ -49,7 +54,7 @@ class AgentConfig:
     """Units of the actor's and the critic's tanh layers."""
     critic: CriticInput = "asymmetric"
     """What the critic reads: the simulator's state instead of images, or what the actor
-    senses, by an encoder of its own."""
+    senses, by an encoder of its own; "none": the algorithm has critics of its own."""
     auxiliary_weight: float = 3.0
     """Weight of the loss that predicts where the named object is; 0: no such head."""
 

@@ -126,6 +126,19 @@ class GoalBatch:
             measure = Measure.where(chosen, kind.measure(scene, asked), measure)
         return measure
 
+    def rows(self, index: Tensor) -> GoalBatch:
+        """Return the goals of some scenes [M], each as often as its row is named."""
+
+        def pick(value: Tensor | GoalBatch) -> Tensor | GoalBatch:
+            return value.rows(index) if isinstance(value, GoalBatch) else value[index]
+
+        return GoalBatch(
+            tuple(
+                (c[index], kind, SimpleNamespace(**_mapped(pick, vars(asked))))
+                for c, kind, asked in self.parts
+            )
+        )
+
 
 class GoalTable:
     """Goals as columns of tensors, by kind, to be dealt to any batch of scenes.
@@ -191,6 +204,10 @@ def _column(name: str, values: list[Any], hands: Mapping[str, Tensor]) -> Deal:
         f"field {name!r} of a goal: got {values[0]!r}, expected a Ref, a Goal, a "
         "number, or a field named `hand` or `direction`"
     )
+
+
+def _mapped(function: Callable, values: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: function(value) for name, value in values.items()}
 
 
 def _indexed(column: Tensor) -> Deal:

@@ -68,7 +68,7 @@ class Seats:
 class Free:
     """Objects drawn from a pool, anywhere in an area that the robot reaches."""
 
-    def __init__(self, drawn: Drawn, robot: Robot, split: str) -> None:
+    def __init__(self, drawn: Drawn, robot: Robot | type[Robot], split: str) -> None:
         self.drawn = drawn
         self.split = split
         self.reach = robot.reach / robot.scale
@@ -193,7 +193,7 @@ class Free:
         return all(map(self._touches, ("left", "right"), places))
 
 
-def layout_of(experiment: Experiment, robot: Robot) -> Seats | Free:
+def layout_of(experiment: Experiment, robot: Robot | type[Robot]) -> Seats | Free:
     """Return how the experiment's objects are laid out for a robot."""
     drawn, spoken = experiment.objects, experiment.instructions
     if isinstance(drawn, Drawn) and isinstance(spoken, Spoken):

@@ -87,7 +87,8 @@ def reward_terms(
     `fouled` says whether there was a foul in the episode, this step's too [N] bool.
     """
     clean, fouled = (~fouled).float(), fouled.float()
-    each = scene.distance.where(measure.serves, torch.inf).amin(dim=2)  # [N, F]
+    away = scene.to_object - measure.aim[:, None]  # [N, F, C, 3]
+    each = away.norm(dim=3).where(measure.serves, torch.inf).amin(dim=2)  # [N, F]
     gather = (1 - torch.tanh(each / NEAR)).sum(dim=1)  # fingers that may not: 0
     gather = gather / measure.serves.any(dim=2).sum(dim=1).clamp(min=1)
     speed = scene.velocity.norm(dim=2) * measure.still  # [N, C]

@@ -69,7 +69,7 @@ class Speaker:
             slot, xy = self.layout.lay_out(stream.uniform(size=(1, self.layout.noise)))
             there = self._things(slot[0], xy[0])
             if wanted is None:
-                instruction = self._say(there, rng)
+                instruction = self.say(there, rng)
             else:
                 free = told is not None  # what users ask for need not be in reach
                 fits = self.is_true(wanted.goal, there) and (
@@ -91,7 +91,7 @@ class Speaker:
             if index >= 0
         ]
 
-    def _say(self, scene: Sequence[Thing], rng: Random) -> Instruction | None:
+    def say(self, scene: Sequence[Thing], rng: Random) -> Instruction | None:
         """Return something to say of a scene; None: there is nothing."""
         spoken, allows = self.spoken, self.layout.allows(scene)
         try:

@@ -8,6 +8,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
 
 from torch import Tensor
 from torch.optim import Optimizer
@@ -50,6 +52,8 @@ class Algorithm(ABC):
     """Whose `policy` is evaluated and kept."""
     share: float = 0.0
     """Share of the training that is done, set by the runner; schedules follow it."""
+    learns_while_stepping: ClassVar[bool] = False
+    """Whether `update` may come while the envs step, before `observe`."""
 
     @abstractmethod
     def __init__(self, config: TrainConfig, state: State, actions: int) -> None:
@@ -74,6 +78,12 @@ class Algorithm(ABC):
     @abstractmethod
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
         """Go on from what `state_dict` returned."""
+
+    def keep_in(self, folder: Path) -> None:  # noqa: B027 - most have nothing to keep
+        """Learn where to keep what is too large for a checkpoint, before anything else.
+
+        Whoever goes on from a checkpoint is told the same folder.
+        """
 
     def restart(self) -> None:  # noqa: B027 - most have nothing to forget
         """Learn that all envs begin new episodes, though none was seen to end."""

@@ -15,10 +15,11 @@ from ir_maniskill.environment.reward_generator import RewardWeights
 
 ControlMode = Literal["pd_joint_target_delta_pos", "pd_joint_pos"]
 RewardMode = Literal["dense", "sparse"]
+AlgorithmName = Literal["ppo", "sac"]
 SimBackend = Literal["physx_cpu", "physx_cuda"]
 RenderBackend = Literal["auto", "cpu"]
 
-SCHEMA = 2
+SCHEMA = 3
 """Version of the form in which configs are written."""
 
 MAY_CHANGE = {
@@ -74,6 +75,46 @@ class PPOConfig:
 
 
 @dataclass(frozen=True)
+class SACConfig:
+    """Soft actor-critic with hindsight: episodes are judged under many sentences."""
+
+    capacity: int = 150_000
+    """Steps that the replay has room for; the oldest make room."""
+    random_steps: int = 2_000
+    """Steps at the start whose actions are random, over all envs."""
+    first_steps: int = 3_000
+    """Steps after which learning begins."""
+    others: int = 8
+    """Sentences under which an episode is judged beside its own, at most."""
+    own: float = 0.1
+    """Share of the steps that are learned from under what was said; the rest is under
+    any of its sentences."""
+    batch: int = 256
+    """Steps of each gradient."""
+    gradients: int = 2
+    """Gradients of the critics for each step of all envs."""
+    actor_every: int = 2
+    """Gradients of the critics for one of the actor."""
+    learning_rate: float = 3e-4
+    """Adam's step size."""
+    gamma: float = 0.95
+    """Discount of a step."""
+    reward_scale: float = 0.2
+    """Factor of rewards, beside which entropy counts."""
+    polyak: float = 0.005
+    """How far the slow critics follow at each gradient."""
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot work."""
+        positive = "capacity first_steps batch gradients actor_every"
+        require_fields(self, positive, lambda x: x > 0, "at least 1")
+        require_fields(self, "random_steps others", lambda x: x >= 0, "0 or more")
+        require_fields(self, "gamma own polyak", lambda x: 0 <= x <= 1, "0 to 1")
+        above = "learning_rate reward_scale"
+        require_fields(self, above, lambda x: 0 < x < math.inf, "more than 0")
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """One training run: the task, the learner, the budget, and where it is kept."""
 
@@ -122,8 +163,13 @@ class TrainConfig:
     """Steps from one complete checkpoint to the next."""
     agent: AgentConfig = field(default_factory=lambda: AgentConfig(posture_gain=1.0))
     """The learner."""
+    algorithm: AlgorithmName = "ppo"
+    """How it learns: the paper's proximal policy optimization, or soft actor-critic
+    with hindsight."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
-    """How it learns."""
+    """Of the former."""
+    sac: SACConfig = field(default_factory=SACConfig)
+    """Of the latter."""
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
@@ -137,6 +183,12 @@ class TrainConfig:
         fits = gain == 0 or self.control_mode == "pd_joint_target_delta_pos"
         expected = "0 where actions do not change the joint targets (control_mode)"
         require(fits, "posture_gain", gain, expected)
+        agent, sac = self.agent, self.algorithm == "sac"
+        fits = (agent.actor == "squashed", agent.critic == "none") == (sac, sac)
+        expected = "'squashed' and 'none' with 'sac', others with 'ppo'"
+        require(fits, "actor and critic", (agent.actor, agent.critic), expected)
+        fits = not (sac and "state" in (agent.senses or ()))
+        require(fits, "senses", agent.senses, "no 'state', which tells one sentence's")
 
     @property
     def steps_per_env(self) -> int:
@@ -154,6 +206,7 @@ class TrainConfig:
         sees = senses is None or "vision" in senses
         # The critic and the auxiliary loss read the simulator's state.
         learns_from = agent.critic == "asymmetric" or agent.auxiliary_weight > 0
+        learns_from &= self.algorithm == "ppo"  # hindsight asks for snapshots instead
         state = (training and learns_from) or "state" in (senses or ())
         modes = {(True, True): "rgb+state_dict", (True, False): "rgb"}
         cameras: dict[str, Any] = {"width": self.camera_width}
@@ -167,8 +220,11 @@ class TrainConfig:
             "reward_mode": "sparse",
             "sensor_configs": cameras,
         }
-        if asks(self.agent):
-            kwargs["observe"] = asks(self.agent)
+        asked = asks(self.agent)
+        if training and self.algorithm == "sac":
+            asked = tuple({*asked, "snapshot", "joint_velocity", "text"})
+        if asked:
+            kwargs["observe"] = asked
         if training:
             kwargs["reward_mode"] = self.reward_mode
             kwargs["reward_weights"] = dataclasses.asdict(self.reward_weights)
@@ -177,6 +233,20 @@ class TrainConfig:
 
 CONFIGS: dict[str, TrainConfig] = {
     "default": TrainConfig(),
+    "listen": TrainConfig(
+        algorithm="sac",
+        total_steps=100_000,
+        threads=1,
+        frames=1,
+        penalty_warmup=0.0,
+        agent=AgentConfig(
+            vision="cells",
+            actor="squashed",
+            critic="none",
+            language_length=40,
+            auxiliary_weight=2.0,
+        ),
+    ),
     "vision": TrainConfig(
         total_steps=60_000,
         eval_episodes=30,
@@ -215,7 +285,7 @@ CONFIGS: dict[str, TrainConfig] = {
     ),
 }
 """The named configurations: "default" for all that feel their joints, "vision" for
-pictures alone, "paper" as published; all run the same code."""
+pictures alone, "paper" as published, "listen" for many sentences, by hindsight."""
 
 
 # -- Files -----------------------------------------------------------------------------
@@ -256,6 +326,11 @@ def migrate(data: object) -> object:
         fields = _from_version_1(fields)
     if isinstance(agent := fields.get("agent"), dict):
         fields["agent"] = without_constants(agent)
+        if schema < 3:
+            fields["agent"] = {"actor": "gaussian", **fields["agent"]}
+    if schema < 3:
+        sac = dataclasses.asdict(SACConfig())
+        fields = {"algorithm": "ppo", "sac": sac, **fields}
     return fields
 
 

@@ -18,9 +18,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ir_maniskill.agent.agent import Agent
+from ir_maniskill.environment.process_vector import ProcessVectorEnv, Step
 from ir_maniskill.environment.senses import State, StateStack
 from ir_maniskill.environment.vector import VectorEnv, info_of_step
 from ir_maniskill.evaluation.evaluate import EvaluationReport, evaluate_policy, threads
+from ir_maniskill.language import KINDS
 from ir_maniskill.training import checkpoint, distributed
 from ir_maniskill.training.algorithm import Algorithm, Outcome
 from ir_maniskill.training.checkpoint import CheckpointError, Stored
@@ -69,12 +71,14 @@ class Runner:
         self.device = distributed.device()
         self.stack, self.counts = StateStack(config.frames), StepCounts()
         self.steps, self.saved, self.evaluated = 0, 0, 0
+        self.seconds = {"collect": 0.0, "update": 0.0}
         self.best_score = -math.inf
         torch.manual_seed(config.seed)
         torch.set_num_threads(1)  # orthogonal weights depend on it in their last bits
         self.state = self._new_scenes()
         actions = math.prod(envs.single_action_space.shape or ())
         self.algorithm = algorithm(config, self.state, actions)
+        self.algorithm.keep_in(folder.path)
 
     # -- The loop --------------------------------------------------------------------
 
@@ -106,31 +110,31 @@ class Runner:
     def advance(self) -> Figures:
         """Step the envs until the algorithm has learned something."""
         figures: Figures = {}
-        seconds = {"collect": 0.0, "update": 0.0}
+        self.seconds = {"collect": 0.0, "update": 0.0}
         while not figures:
             started = time.perf_counter()
-            self.step()
-            stepped = time.perf_counter()
-            with threads(self.config.threads or distributed.threads()):
-                figures = self.algorithm.update()
-            seconds["collect"] += stepped - started
-            seconds["update"] += time.perf_counter() - stepped
+            figures = self.step()
+            self.seconds["collect"] += time.perf_counter() - started
+        self.seconds["collect"] -= self.seconds["update"]
         means, self.counts = self.counts.means(), StepCounts()
         figures = {f"train/{k}": v for k, v in means.items()} | figures
-        figures |= {f"time/{name}": value for name, value in seconds.items()}  # [s]
+        figures |= {f"time/{k}": v for k, v in self.seconds.items()}  # [s]
         if distributed.rank() == 0:
             self.folder.log("metrics", self.steps, figures)
         return figures
 
-    def step(self) -> None:
-        """Let the algorithm act in all envs, and show it what that led to."""
+    def step(self) -> Figures:
+        """Let the algorithm act in all envs, see what that led to, and learn.
+
+        Returns:
+            Figures of what it learned, if it is time for them.
+        """
         check_finite(self.state, "observation", "the simulation became unstable")
         self.algorithm.share = min(self.steps / self.config.total_steps, 1.0)
         with threads(1):  # the cores belong to the simulator's workers
             action = self.algorithm.act(self.state)
-            obs, reward, terminated, truncated, info = self.envs.step(
-                action.to(self.envs.device)
-            )
+            figures, stepped = self._stepped(action.to(self.envs.device))
+            obs, reward, terminated, truncated, info = stepped
             done, final = terminated | truncated, None
             if "final_info" in info:
                 final = self._here(self.stack.peek(info["final_obs"]))
@@ -145,6 +149,27 @@ class Runner:
             here = self._here(paid | ends)
             self.algorithm.observe(Outcome(**here, state=self.state, final=final))
         self.steps += self.config.num_envs
+        return self._learned() if figures is None else figures
+
+    def _stepped(self, action: Tensor) -> tuple[Figures | None, Step]:
+        """Step all envs; if the algorithm can, let it learn meanwhile.
+
+        Returns:
+            The figures, or None if it has yet to learn; what the step led to.
+        """
+        together = self.algorithm.learns_while_stepping
+        if not (together and isinstance(self.envs, ProcessVectorEnv)):
+            return None, self.envs.step(action)
+        self.envs.step_async(action)
+        figures = self._learned()
+        return figures, self.envs.step_wait()
+
+    def _learned(self) -> Figures:
+        started = time.perf_counter()
+        with threads(self.config.threads or distributed.threads()):
+            figures = self.algorithm.update()
+        self.seconds["update"] += time.perf_counter() - started
+        return figures
 
     def _here(self, state: State) -> State:
         """Return tensors on the learner's device."""
@@ -338,7 +363,11 @@ def figures_of(report: EvaluationReport) -> Figures:
     names = ("success", "exclusive", "holding", "right_fingers", "wrong_fingers")
     overall = report.overall.as_dict()
     worst = min(score.success.value for score in report.instructions.values())
-    return {"eval/worst": worst} | {f"eval/{name}": overall[name] for name in names}
+    figures = {"eval/worst": worst} | {f"eval/{name}": overall[name] for name in names}
+    for name, score in report.instructions.items():
+        if name in KINDS:
+            figures[f"eval/{name}"] = score.exclusive.value
+    return figures
 
 
 SHOWN = {

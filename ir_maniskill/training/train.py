@@ -27,6 +27,10 @@ from ir_maniskill.training.config import (
 from ir_maniskill.training.ppo import PPO
 from ir_maniskill.training.run_folder import RunFolder, stored_config
 from ir_maniskill.training.runner import Runner
+from ir_maniskill.training.sac import SAC
+
+ALGORITHMS: dict[str, type[Algorithm]] = {"ppo": PPO, "sac": SAC}
+"""What `TrainConfig.algorithm` names."""
 
 
 def train(
@@ -34,7 +38,7 @@ def train(
     resume: bool = False,
     envs: VectorEnv | None = None,
     eval_envs: VectorEnv | None = None,
-    algorithm: type[Algorithm] = PPO,
+    algorithm: type[Algorithm] | None = None,
     *,
     preset: str = "default",
     **changes: Any,
@@ -51,7 +55,7 @@ def train(
             folder's own config; of what is given only `MAY_CHANGE` may differ from it.
         envs: Vector of this rank's envs to use (and leave open) instead of making one.
         eval_envs: The same for evaluations, which only the first rank makes.
-        algorithm: What learns.
+        algorithm: What learns; None: what the config names.
         preset: Which of `CONFIGS` to train a task with.
         **changes: Fields that shall be other than in the preset, or in `task`.
 
@@ -84,7 +88,7 @@ def run(
     resume: bool = False,
     envs: VectorEnv | None = None,
     eval_envs: VectorEnv | None = None,
-    algorithm: type[Algorithm] = PPO,
+    algorithm: type[Algorithm] | None = None,
 ) -> Path:
     """Train as `train` does, but take `config` as it is, also to resume."""
     with contextlib.ExitStack() as leaving:
@@ -116,7 +120,8 @@ def run(
             leaving.callback(made.close)
             return made
 
-        runner = Runner(config, folder, envs, evaluated_in, algorithm)
+        chosen = algorithm or ALGORITHMS[config.algorithm]
+        runner = Runner(config, folder, envs, evaluated_in, chosen)
         if stored is not None:
             runner.restore(stored)
         runner.learn()

@@ -1,0 +1,237 @@
+"""Hindsight: what an episode would have been worth under other sentences.
+
+A goal is measured on snapshots alone, so a hand that touched the wrong cube has shown
+what touching that one is like. The rewards are those that the env would have given.
+
+Legend: R = T + 1 rows of an episode of T steps, M sentences, F fingers, C objects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from random import Random
+
+import torch
+from torch import Tensor
+
+from ir_maniskill import experiment as catalog
+from ir_maniskill.environment import reward_generator
+from ir_maniskill.environment.instructional_set import GoalBatch, GoalTable
+from ir_maniskill.environment.layout import layout_of
+from ir_maniskill.environment.reward_generator import Verdict
+from ir_maniskill.environment.robots.robot import available_robots, find_robot
+from ir_maniskill.environment.senses import text_of, tokens_of
+from ir_maniskill.environment.speaker import Speaker
+from ir_maniskill.experiment import Experiment, Spoken
+from ir_maniskill.goals import SHAPES, Instruction, Measure
+from ir_maniskill.language import parse, things
+from ir_maniskill.snapshot import Snapshot
+from ir_maniskill.training.config import TrainConfig
+
+
+@dataclass(frozen=True)
+class Judged:
+    """An episode under M sentences; row 0 is how it began, with nothing paid."""
+
+    reward: Tensor
+    """What the step to each row is worth [R, M]."""
+    goal: Tensor
+    """What a critic is told of each goal, and of how far it is reached [R, M, D]."""
+    named: Tensor
+    """Middle of the objects that each sentence asks about [R, M, 3] [m]."""
+    holds: Tensor
+    """Whether each goal is reached [R, M] bool."""
+    fouled: Tensor
+    """Whether there was a foul so far [R, M] bool."""
+
+
+class Hindsight:
+    """Finds sentences that are true of an episode's scene, and judges it under them."""
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        hands: Mapping[str, Sequence[str]],
+        weights: Tensor | None,
+        others: int,
+        speaker: Speaker | None = None,
+    ) -> None:
+        """Take what the env judges by.
+
+        Args:
+            experiment: The task.
+            hands: The robot's hands, and the fingers of each.
+            weights: Of the dense reward's terms [K]; None: the sparse reward.
+            others: Sentences to find beside the episode's own, at most.
+            speaker: Draws the sentences, if the task does not list them.
+        """
+        self.experiment, self.weights, self.speaker = experiment, weights, speaker
+        fingers = [finger for hand in hands.values() for finger in hand]
+        self.fingers = len(fingers)
+        self._hands = {
+            name: torch.tensor([finger in own for finger in fingers])
+            for name, own in hands.items()
+        }
+        listed = experiment.instructions
+        self._listed = () if isinstance(listed, Spoken) else listed
+        self.sentences = 1 + min(
+            others, len(self._listed) - 1 if self._listed else others
+        )
+        """M."""
+
+    @classmethod
+    def of(cls, config: TrainConfig, others: int) -> Hindsight:
+        """Return that of a training's task and robot."""
+        experiment = catalog.get(config.env_id)
+        robot = find_robot(config.robot)
+        robot = available_robots()[robot] if isinstance(robot, str) else robot
+        dense = config.reward_mode == "dense"
+        weights = config.reward_weights.vector() if dense else None
+        speaker = None
+        if isinstance(experiment.instructions, Spoken):
+            speaker = Speaker(experiment, layout_of(experiment, robot))
+        return cls(experiment, robot.hands, weights, others, speaker)
+
+    # -- Sentences -------------------------------------------------------------------
+
+    def find(self, start: Snapshot, said: str) -> list[Instruction]:
+        """Return M instructions that are true of a scene [1], what was said first."""
+        known = {instruction.text: instruction for instruction in self._listed}
+        own = known.get(said) or Instruction(said, parse(said))
+        count = self.sentences - 1
+        if self.speaker is None:
+            others = [each for each in self._listed if each != own]
+            order = torch.randperm(len(others))[:count].tolist()
+            return [own, *(others[i] for i in order)]
+        rng = Random(int(torch.randint(2**31, ())))
+        (scene,) = things(start)
+        drawn = (self.speaker.say(scene, rng) for _ in range(count))
+        return [own, *(each or own for each in drawn)]
+
+    def read(
+        self, instructions: Sequence[Instruction], entries: Mapping[str, int]
+    ) -> dict[str, Tensor]:
+        """Return the sentences as a state has them [M, ...], in entries so long."""
+        texts = [instruction.text for instruction in instructions]
+        read: dict[str, Tensor] = {}
+        if "instruction" in entries:
+            words, length = self.experiment.vocabulary, entries["instruction"]
+            read["instruction"] = tokens_of(texts, words, length).to(torch.int16)
+        if "text" in entries:
+            read["text"] = text_of(texts, entries["text"])
+        return read
+
+    # -- Judging ---------------------------------------------------------------------
+
+    def judge(self, episode: Snapshot, instructions: Sequence[Instruction]) -> Judged:
+        """Judge an episode [R], whose goals are resolved where it began."""
+        rows, count = len(episode.contact), len(instructions)
+        table = GoalTable([i.goal for i in instructions], self._hands, _CPU)
+        start = episode.rows(torch.zeros(count, dtype=torch.int64))
+        goals = table.deal(torch.arange(count), start)
+        goals = goals.rows(torch.arange(count).repeat(rows))
+        scene = episode.rows(torch.arange(rows).repeat_interleave(count))
+        scene, measure, after = _staged(scene, goals, rows)
+        verdict = reward_generator.judge(scene, measure)
+        foul = verdict.foul.view(rows, count).clone()
+        foul[0] = False  # what was before the first step is nobody's fault
+        fouled = foul.cummax(dim=0).values.flatten()
+        reward = self._pay(scene, measure, verdict, fouled).view(rows, count)
+        goal = describe(scene, after, verdict, fouled)
+        named = _middle(scene.position, after)
+        return Judged(
+            reward=reward * (torch.arange(rows) > 0)[:, None],
+            goal=goal.view(rows, count, -1),
+            named=named.view(rows, count, 3),
+            holds=measure.holds.view(rows, count),
+            fouled=fouled.view(rows, count),
+        )
+
+    def _pay(
+        self, scene: Snapshot, measure: Measure, verdict: Verdict, fouled: Tensor
+    ) -> Tensor:
+        if self.weights is None:
+            wrong = verdict.wrong.sum(dim=1)
+            return reward_generator.sparse_reward(
+                self.experiment, measure.holds, measure.level, wrong
+            )
+        terms = reward_generator.reward_terms(scene, measure, verdict, fouled)
+        return terms @ self.weights
+
+
+_CPU = torch.device("cpu")
+
+
+def _staged(
+    scene: Snapshot, goals: GoalBatch, rows: int
+) -> tuple[Snapshot, Measure, Measure]:
+    """Measure goals at the stage that sequences had reached before each row.
+
+    Returns:
+        The scenes at that stage, what was measured there, and what is asked after it.
+    """
+    scene = scene.at_stage(torch.zeros_like(scene.stage))
+    measure = goals.measure(scene)
+    while True:  # each round finds what follows from one more goal that was reached
+        reached = measure.stage.view(rows, -1).clone()
+        reached[0] = 0
+        reached = reached.cummax(dim=0).values
+        before = reached.roll(1, dims=0)
+        before[0] = 0
+        if torch.equal(before.flatten(), scene.stage):
+            break
+        scene = scene.at_stage(before.flatten())
+        measure = goals.measure(scene)
+    if not reached.any():
+        return scene, measure, measure
+    return scene, measure, goals.measure(scene.at_stage(reached.flatten()))
+
+
+def _middle(values: Tensor, measure: Measure) -> Tensor:
+    """Return the mean over the objects that a goal asks about [N, C, 3] -> [N, 3]."""
+    named = measure.serves.any(dim=1)[..., None]  # [N, C, 1]
+    return (values * named).sum(dim=1) / named.sum(dim=1).clamp(min=1)
+
+
+# -- What critics read -----------------------------------------------------------------
+
+LENGTH = 0.1
+"""What lengths are divided by, to be about as large as other numbers [m]."""
+
+
+def describe(
+    scene: Snapshot, measure: Measure, verdict: Verdict, fouled: Tensor
+) -> Tensor:
+    """Return what a goal asks, and how far it is, as numbers [N, D].
+
+    They come from its measure alone, so they serve for any kind of goal.
+    """
+    serves = measure.serves  # [N, F, C]
+    aim = (scene.position[:, None] + measure.aim[:, None]).where(serves[..., None], 0)
+    each = aim.sum(dim=2) / serves.sum(dim=2, keepdim=True).clamp(min=1)  # [N, F, 3]
+    way = (each - scene.fingertip) * serves.any(dim=2, keepdim=True)
+    flags = (
+        *(serves, measure.bars.any(dim=1), measure.may_move, measure.still),
+        *(verdict.right, verdict.wrong, verdict.disturbed, measure.holds, fouled),
+    )
+    lengths = (way, _middle(scene.position, measure), 2 * _middle(scene.moved, measure))
+    numbers = (measure.level, measure.gap / LENGTH, measure.stage)
+    columns = [
+        *(flag.flatten(1) if flag.ndim > 1 else flag[:, None] for flag in flags),
+        *(length.flatten(1) / LENGTH for length in lengths),
+        *(number[:, None] for number in numbers),
+    ]
+    return torch.cat([column.float() for column in columns], dim=1).clamp(-10, 10)
+
+
+def simulated(scene: Snapshot) -> Tensor:
+    """Return a scene as numbers, whatever is asked in it [N, D]."""
+    there = (scene.color >= 0).float()  # [N, C]
+    kinds = torch.nn.functional.one_hot(scene.shape.clamp(min=0), len(SHAPES))
+    columns = (
+        *(scene.contact.float(), scene.fingertip / LENGTH, there),
+        *(kinds * there[..., None], scene.position * there[..., None] / LENGTH),
+        *(2 * scene.moved / LENGTH, scene.velocity / LENGTH),
+    )
+    return torch.cat([c.flatten(1) for c in columns], dim=1).clamp(-10, 10)

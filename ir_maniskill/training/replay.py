@@ -1,0 +1,163 @@
+"""Replay: what was seen and done, each frame once, as plain tensors by name.
+
+An episode of T steps is T + 1 rows one after the other; the last one has no step. The
+oldest rows make room for the newest. Legend: N rows, S stacked observations.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+Rows = dict[str, Tensor]
+"""Tensors by name [N, ...]."""
+
+EPISODE, AGE = "replay.episode", "replay.age"
+"""Of each row: its episode's number (-1: being written), and which step of that."""
+
+
+class Replay:
+    """Rows in a ring of limited size: in memory, or in files that outlive it."""
+
+    def __init__(self, capacity: int) -> None:
+        """Have room for that many rows, once it is known what is in one."""
+        self.capacity = capacity
+        self.written = 0
+        """Rows written so far, also those that have made room since."""
+        self.episodes = 0
+        self._folder: Path | None = None
+        self._rows: Rows = {}
+
+    def keep_in(self, folder: Path) -> None:
+        """Keep the rows in files of this folder, before any were added."""
+        self._folder = folder
+
+    def __len__(self) -> int:
+        return min(self.written, self.capacity)
+
+    @property
+    def bytes(self) -> int:
+        """Size of all that there is room for [byte]."""
+        return sum(rows.nbytes for rows in self._rows.values())
+
+    # -- Writing ---------------------------------------------------------------------
+
+    def add(self, episode: Mapping[str, Tensor]) -> None:
+        """Add the T + 1 rows of an episode.
+
+        Raises:
+            ValueError: It is longer than the replay.
+        """
+        count = len(next(iter(episode.values())))
+        if count > self.capacity:
+            raise ValueError(
+                f"replay: got an episode of {count} rows, room for {self.capacity}"
+            )
+        self._make_room(episode)
+        where = (self.written + torch.arange(count)) % self.capacity
+        # Were the process killed here, these rows would belong to no episode.
+        self._rows[EPISODE][where] = -1
+        for name, rows in episode.items():
+            self._rows[name][where] = rows.to(self._rows[name].dtype)
+        self._rows[AGE][where] = torch.arange(count)
+        self._rows[EPISODE][where] = self.episodes
+        self.written += count
+        self.episodes += 1
+
+    def _make_room(self, like: Mapping[str, Tensor]) -> None:
+        """Make or map the rows, when the first episode tells what they have."""
+        if self._rows:
+            return
+        layout = {name: (rows.dtype, rows.shape[1:]) for name, rows in like.items()}
+        layout |= {name: (torch.int64, torch.Size()) for name in (EPISODE, AGE)}
+        if self._folder is not None:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            shapes = {
+                k: [str(dtype), list(shape)] for k, (dtype, shape) in layout.items()
+            }
+            text = json.dumps({"capacity": self.capacity, "rows": shapes})
+            (self._folder / "layout.json").write_text(text)
+        for name, (dtype, shape) in layout.items():
+            self._rows[name] = self._room(name, dtype, shape)
+        self._rows[EPISODE].fill_(-1)
+
+    def _room(self, name: str, dtype: torch.dtype, shape: torch.Size) -> Tensor:
+        size = self.capacity * math.prod(shape)
+        if self._folder is None:
+            return torch.zeros(self.capacity, *shape, dtype=dtype)
+        path = str(self._folder / name)
+        mapped = torch.from_file(path, shared=True, size=size, dtype=dtype)
+        return mapped.view(self.capacity, *shape)
+
+    # -- Reading ---------------------------------------------------------------------
+
+    def draw(self, count: int) -> Tensor:
+        """Return rows at random that have a next one [N] int64."""
+        found = torch.empty(0, dtype=torch.int64)
+        while len(found) < count:
+            rows = torch.randint(len(self), (2 * count,))
+            episode = self._rows[EPISODE]
+            steps = episode[rows] == episode[self.after(rows)]
+            found = torch.cat([found, rows[steps & (episode[rows] >= 0)]])
+        return found[:count]
+
+    def after(self, rows: Tensor) -> Tensor:
+        """Return the rows that come next [N]."""
+        return (rows + 1) % self.capacity
+
+    def read(
+        self,
+        name: str,
+        rows: Tensor,
+        *,
+        frames: int | None = None,
+        column: Tensor | None = None,
+    ) -> Tensor:
+        """Return entries of rows [N, ...].
+
+        `column` takes one of each row [N]. `frames` returns the last S up to each row
+        [N, S, ...]; before an episode there is nothing: its first row fills the stack.
+        """
+        if column is not None:
+            return self._rows[name][rows, column]
+        if frames is None:
+            return self._rows[name].index_select(0, rows)
+        back = torch.arange(frames).minimum(self._rows[AGE][rows][:, None])  # [N, S]
+        index = (rows[:, None] - back) % self.capacity
+        return self._rows[name][index]
+
+    # -- Resuming --------------------------------------------------------------------
+
+    def state_dict(self) -> Rows:
+        """Return how far it was written; the rows are in the folder."""
+        return {"written": torch.tensor([self.written, self.episodes])}
+
+    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
+        """Go on with the rows in the folder; without one, with none.
+
+        Raises:
+            ValueError: They are not there, or have another layout.
+        """
+        if self._folder is None:
+            return
+        written, episodes = tensors["written"].tolist()
+        if not written:
+            return
+        path = self._folder / "layout.json"
+        if not path.exists():
+            raise ValueError(f"replay: got nothing in {self._folder}")
+        layout = json.loads(path.read_text())
+        if layout["capacity"] != self.capacity:
+            got = layout["capacity"]
+            raise ValueError(f"replay: got {got} rows, expected {self.capacity}")
+        for name, (dtype, shape) in layout["rows"].items():
+            kind = getattr(torch, dtype.removeprefix("torch."))
+            self._rows[name] = self._room(name, kind, torch.Size(shape))
+        self.written, self.episodes = written, episodes
+        # Rows of a later time than the checkpoint's would pass for those to come.
+        self._rows[EPISODE][self._rows[EPISODE] >= episodes] = -1

@@ -1,0 +1,118 @@
+"""What an episode would have been worth under other sentences."""
+
+import gymnasium as gym
+import pytest
+import torch
+from scenes import scene
+
+from ir_maniskill import experiment as catalog
+from ir_maniskill.environment.reward_generator import RewardWeights
+from ir_maniskill.goals import Avoid, Both, Instruction, Push, Ref, Then, Touch
+from ir_maniskill.snapshot import Snapshot
+from ir_maniskill.training.config import CONFIGS
+from ir_maniskill.training.hindsight import Hindsight
+
+HANDS = {"left": ("a", "b", "c"), "right": ("d", "e", "f")}
+SHUFFLED = catalog.get("NaoTouchCubeShuffled-v1")
+
+
+def joined(*scenes):
+    """Return an episode of one-row snapshots."""
+    rows = zip(*(vars(each).values() for each in scenes), strict=True)
+    return Snapshot(*(torch.cat(parts) for parts in rows))
+
+
+def told(*goals):
+    return [Instruction(f"Goal {index}.", goal) for index, goal in enumerate(goals)]
+
+
+def sparse():
+    return Hindsight(SHUFFLED, HANDS, None, others=2)
+
+
+def test_a_touch_of_the_wrong_cube_is_a_right_one_under_another_sentence() -> None:
+    # Nothing; two fingers on red; one of the left hand on blue.
+    episode = joined(scene(), scene((0, 1), (3, 1)), scene((2, 0)))
+    goals = Touch(Ref("blue")), Touch(Ref("red")), Touch(Ref("blue"), "right")
+    judged = sparse().judge(episode, told(*goals))
+    assert judged.holds.tolist() == [[0, 0, 0], [0, 1, 0], [1, 0, 0]]
+    assert judged.fouled.tolist() == [[0, 0, 0], [1, 0, 1], [1, 1, 1]]
+    # The task pays 1 a finger, and takes 0.1 for each wrong one.
+    expected = [[0, 0, 0], [-0.2, 2, -0.2], [1, -0.1, -0.1]]
+    torch.testing.assert_close(judged.reward, torch.tensor(expected))
+    blue, red = [0.19, 0.0, 0.05], [0.23, 0.08, 0.05]
+    torch.testing.assert_close(judged.named[1, :2], torch.tensor([blue, red]))
+
+
+def test_what_is_touched_when_an_episode_begins_is_no_foul() -> None:
+    judged = sparse().judge(joined(scene((0, 1)), scene()), told(Touch(Ref("blue"))))
+    assert not judged.fouled.any()
+
+
+def test_sequences_go_on_from_what_was_reached_before() -> None:
+    goal = Then(Touch(Ref("red")), Then(Touch(Ref("blue")), Touch(Ref("red"))))
+    red, blue, none = scene((0, 1)), scene((0, 0)), scene()
+    judged = sparse().judge(joined(none, blue, red, blue, none, red), told(goal))
+    assert judged.holds.flatten().tolist() == [False] * 5 + [True]
+    other = sparse().judge(joined(none, red, none, red), told(goal))
+    assert not other.holds.any()
+
+
+def test_critics_are_told_of_every_kind_of_goal_in_as_many_numbers() -> None:
+    blue, red = Ref("blue"), Ref("red")
+    goals = (
+        Touch(blue),
+        Push(red, "left"),
+        Both(Touch(blue, "left"), Avoid(red)),
+        Then(Touch(red), Push(blue, "away")),
+    )
+    goal = sparse().judge(joined(scene(), scene((0, 1))), told(*goals)).goal
+    assert goal.shape[:2] == (2, 4)
+    assert len(torch.unique(goal[0], dim=0)) == 4, "two goals look the same"
+
+
+def test_a_listed_task_is_judged_under_its_own_sentences() -> None:
+    hindsight = Hindsight(SHUFFLED, HANDS, None, others=8)
+    found = hindsight.find(scene(), SHUFFLED.sentences[1])
+    assert hindsight.sentences == 3
+    assert found[0].text == SHUFFLED.sentences[1]
+    assert {each.text for each in found} == set(SHUFFLED.sentences)
+    read = hindsight.read(found, {"instruction": 7})
+    assert read["instruction"].shape == (3, 7)
+
+
+@pytest.mark.parametrize("task", ["NaoTouchCubeShuffled-v1", "NaoInstruct-v1"])
+def test_an_episode_is_judged_as_the_env_judged_it(task) -> None:
+    env = gym.make(
+        task,
+        obs_mode="none",
+        control_mode="pd_joint_target_delta_pos",
+        reward_mode="dense",
+        render_backend="none",
+    )
+    base, generator = env.unwrapped, torch.Generator().manual_seed(0)
+    config = CONFIGS["listen"]
+    hindsight = Hindsight.of(type(config)(**{**vars(config), "env_id": task}), others=4)
+    assert hindsight.weights.equal(RewardWeights().vector())
+    touched = 0
+    for seed in range(3):
+        env.reset(seed=seed)
+        scenes, rewards, ends = [base.snapshot()], [], []
+        for _ in range(32):
+            action = 2 * torch.rand(26, generator=generator) - 1
+            _, reward, _, _, info = env.step(action)
+            scenes.append(base.snapshot())
+            rewards.append(reward)
+            ends.append((info["success"], info["wrong_once"]))
+            touched += int(info["contact"].any())
+        rows = Snapshot.unpack(joined(*scenes).pack(), hindsight.fingers)
+        (said,) = base.get_language_instruction()
+        found = hindsight.find(rows.rows(torch.zeros(1, dtype=torch.long)), said)
+        assert found[0].goal == base.instructions[0].goal
+        judged = hindsight.judge(rows, found)
+        torch.testing.assert_close(judged.reward[1:, 0], torch.cat(rewards))
+        holds, wrong = (torch.cat(column) for column in zip(*ends, strict=True))
+        assert judged.holds[1:, 0].equal(holds)
+        assert judged.fouled[1:, 0].equal(wrong)
+    env.close()
+    assert touched > 0, "nothing was judged"

@@ -1,0 +1,167 @@
+import dataclasses
+from functools import partial
+
+import pytest
+import torch
+from torch.distributions import Normal, TanhTransform, TransformedDistribution
+from torch.nn import functional
+from toy_envs import HANDS, LENGTH, TASK, ToyVectorEnv, toy_sac
+
+from ir_maniskill.agent.actor import Squashed
+from ir_maniskill.agent.cell_vision import CameraCells, cells
+from ir_maniskill.checks import ConfigError
+from ir_maniskill.environment.reward_generator import RewardWeights
+from ir_maniskill.environment.senses import StateStack
+from ir_maniskill.training import checkpoint
+from ir_maniskill.training.algorithm import Outcome
+from ir_maniskill.training.hindsight import Hindsight
+from ir_maniskill.training.sac import SAC, Critics
+from ir_maniskill.training.train import run
+
+
+def hindsight(others=1):
+    return Hindsight(TASK, HANDS, RewardWeights().vector(), others)
+
+
+def learn(out, steps, **changes):
+    """Train on the toy task; return the file of the best policy."""
+    envs = ToyVectorEnv(snapshots=True)
+    config = toy_sac(out, total_steps=steps, **changes)
+    algorithm = partial(SAC, hindsight=hindsight())
+    return run(
+        config, envs=envs, eval_envs=ToyVectorEnv(snapshots=True), algorithm=algorithm
+    )
+
+
+# -- Parts -----------------------------------------------------------------------------
+
+
+def test_squashed_actions_are_as_likely_as_torch_says() -> None:
+    torch.manual_seed(0)
+    center, log_std = torch.randn(4, 3), torch.randn(4, 3).clamp(-1, 0)
+    action, log_prob = Squashed(center, log_std).rsample()
+    normal = Normal(center.double(), log_std.double().exp())
+    known = TransformedDistribution(normal, [TanhTransform()])
+    expected = known.log_prob(action.double()).sum(1)
+    torch.testing.assert_close(log_prob.double(), expected, rtol=1e-3, atol=1e-3)
+
+
+def test_both_critics_are_plain_networks_side_by_side() -> None:
+    torch.manual_seed(0)
+    critics = Critics(5)
+    known, action = torch.randn(6, 3), torch.randn(6, 2)
+    both = critics(known, action)
+    for index in range(2):
+        x = torch.cat([known, action], dim=1)
+        for layer in range(3):
+            x = x @ critics.weights[layer][index] + critics.biases[layer][index]
+            if layer < 2:
+                x = functional.relu(functional.layer_norm(x, x.shape[1:]))
+        torch.testing.assert_close(both[index], x[:, 0])
+
+
+def test_cells_are_the_pixels_of_squares() -> None:
+    torch.manual_seed(0)
+    images = torch.randint(256, (2, 3, 2, 8, 12, 3), dtype=torch.uint8)
+    found = cells(images)
+    assert found.shape == (2, 2, 2, 3, 3 * 48)
+    square = images[1, :, 0, 4:8, 8:12]  # frames, rows, columns, colors
+    assert found[0, 1, 1, 2].tolist() == square.flatten().tolist()
+
+
+def test_bytes_are_seen_as_numbers_from_minus_one_to_one() -> None:
+    torch.manual_seed(0)
+    camera = CameraCells(1, film_width=4)
+    byte = torch.randint(256, (1, 2, 2, 48), dtype=torch.uint8)
+    weight, bias = camera.cells.parameters()
+    expected = functional.linear(byte * (2 / 255) - 1, weight, bias)
+    torch.testing.assert_close(camera.read(byte, torch.float32), expected)
+
+
+# -- The algorithm ---------------------------------------------------------------------
+
+
+def test_it_learns_to_touch_what_the_sentence_names(tmp_path) -> None:
+    best = learn(tmp_path / "run", 2000)
+    agent, _, metadata = checkpoint.load_agent(best)
+    assert metadata["evaluation"]["overall"]["success"] == 1
+    assert agent.locator is None, "a policy file has what only training needs"
+
+
+def test_steps_are_drawn_with_the_sentence_that_they_are_judged_under(tmp_path) -> None:
+    algorithm = collected(tmp_path, ToyVectorEnv(snapshots=True))
+    drawn = algorithm._draw()
+    goal = torch.where(drawn["instruction"][:, 1] == 4, -0.6, 0.6)  # token 4: "left"
+    off = (drawn["next.proprioception"][:, 0, 0] - goal).abs()
+    near, far = off < 0.2, off > 0.5
+    assert near.sum() > 5 and far.sum() > 5
+    # Where it holds, a finger each pays 1, or a quarter of it after a foul.
+    assert drawn["reward"][near].min() > 1
+    assert drawn["reward"][far].max() < 3
+    torch.testing.assert_close(drawn["named"][:, 1], 0.1 * goal)
+
+
+def collected(tmp_path, envs, episodes=4):
+    """Return an algorithm that saw some episodes of random actions."""
+    torch.manual_seed(0)
+    stack = StateStack(1)
+    state = stack.reset(envs.reset(seed=0)[0])
+    config = toy_sac(tmp_path)
+    algorithm = SAC(config, state, 2, hindsight=hindsight())
+    for _ in range(episodes * LENGTH):
+        action = algorithm.act(state)
+        obs, reward, terminated, truncated, info = envs.step(action)
+        final = stack.peek(info["final_obs"]) if "final_obs" in info else None
+        state = stack.push(obs, truncated)
+        algorithm.observe(Outcome(reward, terminated, truncated, state, final))
+    return algorithm
+
+
+def test_every_episode_is_kept_whole(tmp_path) -> None:
+    algorithm = collected(tmp_path, ToyVectorEnv(4, snapshots=True), episodes=3)
+    assert algorithm.replay.episodes == 4 * 3
+    assert algorithm.replay.written == 4 * 3 * (LENGTH + 1)
+    rows = torch.arange(LENGTH)
+    joints = algorithm.replay.read("proprioception", rows)
+    actions = algorithm.replay.read("action", rows)
+    after = algorithm.replay.read("proprioception", rows + 1)
+    torch.testing.assert_close((joints + 0.3 * actions).clamp(-1, 1), after)
+
+
+def test_a_resumed_run_goes_on_with_the_replay_of_the_first(tmp_path) -> None:
+    out = tmp_path / "run"
+    learn(out, 1000, checkpoint_interval=10_000)
+    stored = checkpoint.read(out / "last.safetensors")
+    written, episodes = stored.tensors["replay.written"].tolist()
+    assert written > 900
+    envs = ToyVectorEnv(snapshots=True)
+    algorithm = collected(out, envs, episodes=1)
+    algorithm.keep_in(out)
+    algorithm.replay = type(algorithm.replay)(2000)
+    algorithm.keep_in(out)
+    algorithm.load_state_dict(stored.tensors)
+    assert (algorithm.replay.written, algorithm.replay.episodes) == (written, episodes)
+    again = algorithm.state_dict()
+    assert again.keys() <= stored.tensors.keys()
+    for name, tensor in again.items():
+        torch.testing.assert_close(tensor, stored.tensors[name])
+
+
+def test_the_first_value_of_a_discounted_reward_is_the_reward(tmp_path) -> None:
+    envs = ToyVectorEnv(snapshots=True)
+    algorithm = collected(tmp_path, envs)
+    algorithm.config = dataclasses.replace(algorithm.config, gamma=0.0)
+    for _ in range(150):
+        algorithm._improve_critics(algorithm._draw())
+    drawn = algorithm._draw()
+    value = algorithm.critics(algorithm._known(drawn), drawn["action"])
+    off = value - algorithm.config.reward_scale * drawn["reward"]
+    assert off.abs().mean() < 0.1
+
+
+@pytest.mark.parametrize("wrong", [{"actor": "gaussian"}, {"critic": "separate"}])
+def test_an_agent_for_another_algorithm_is_refused(tmp_path, wrong) -> None:
+    config = toy_sac(tmp_path)
+    agent = dataclasses.replace(config.agent, **wrong)
+    with pytest.raises(ConfigError, match="actor and critic"):
+        dataclasses.replace(config, agent=agent)
