@@ -302,9 +302,7 @@ def test_a_vector_plays_what_single_envs_play() -> None:
         alone.close()
         envs.reset(seed=1, options={"instruction": "Touch the yellow can."})
         assert envs.call("get_language_instruction")[1] == ["Touch the yellow can."]
-        with pytest.raises(
-            ValueError, match="got 'Sing.' .*'sing' as word"
-        ):
+        with pytest.raises(ValueError, match="got 'Sing.' .*'sing' as word"):
             envs.reset(options={"instruction": "Sing."})
     finally:
         envs.close()
