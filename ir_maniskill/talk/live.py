@@ -85,7 +85,7 @@ def keep_going(page: Page, film: Film | None = None, until: float = math.inf) ->
             clock = Clock()
             continue
         if clock.share(page.speed) >= 1:
-            page.session.step()
+            page.attempt(page.session.step)
             if film is not None:
                 film.add(page.session)
             clock.tick(page.speed)
