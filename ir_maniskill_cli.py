@@ -16,6 +16,7 @@ A robot learns by reward alone to do what a sentence says.
   train      train an agent
   evaluate   play seeded episodes, and count
   video      film a policy (.mp4 or .gif)
+  talk       open a page to talk to a robot, live
   curve      draw the learning curve of a run (.png)
   bench      measure how fast everything is on this machine
   doctor     say whether this machine can render, and what to install if not

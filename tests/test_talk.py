@@ -216,10 +216,13 @@ def test_a_reset_brings_back_the_scene_and_a_new_scene_another(session):
 
 
 @pytest.mark.render
-def test_what_does_not_fit_is_refused_and_all_stays(session):
+@pytest.mark.parametrize(
+    "wanted", [{"policy": "/etc/passwd"}, {"task": "antigravity:x"}, {"robot": "hal"}]
+)
+def test_what_is_not_there_is_refused_and_all_stays(session, wanted):
     before, env = session.choice, session.env
-    session.choose(policy="NaoTouchMoon-v1")
-    assert "NaoTouchMoon-v1" in session.note
+    session.choose(**wanted)
+    assert repr(*wanted.values()) in session.note and "antigravity" not in sys.modules
     assert session.choice == before and session.env is env
 
 
@@ -340,6 +343,16 @@ def test_wishes_wait_for_the_simulators_thread(page, session):
     assert session.reading.heard != "Touch the green cube." and session.held is None
     assert page.obey() and not page.obey()
     assert session.reading.heard == "Touch the green cube." and session.held[0] == 0
+
+
+@pytest.mark.render
+def test_a_wish_that_fails_ends_nothing(page, session):
+    page._wish(session.drag, 99, 0.2, 0.2)
+    page._wish(session.tell, "Touch the green cube.")
+    assert page.obey() and session.reading.heard == "Touch the green cube."
+    page._set_speed(float("nan"))
+    page._set_speed(100.0)
+    assert page.speed == 2.0
 
 
 @pytest.mark.render

@@ -60,7 +60,7 @@ def run(session: Session, host: str, port: int, record: Path | None = None) -> N
         record: Film to write in the end (.mp4, .gif).
     """
     for chatty in ("websockets", "ir_maniskill.language.tokens"):
-        logging.getLogger(chatty).setLevel(logging.ERROR)  # the page tells it all
+        logging.getLogger(chatty).setLevel(logging.CRITICAL)  # the page tells it
     film = None if record is None else Film()
     with closing(session), closing(Page(session, host, port)) as page:
         log.info("Open %s in a browser; Ctrl-C ends it.", page.address)
@@ -85,7 +85,7 @@ def keep_going(page: Page, film: Film | None = None, until: float = math.inf) ->
             clock = Clock()
             continue
         if clock.share(page.speed) >= 1:
-            page.session.step()
+            page.attempt(page.session.step)
             if film is not None:
                 film.add(page.session)
             clock.tick(page.speed)

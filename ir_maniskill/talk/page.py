@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import logging
 from collections.abc import Callable
 from functools import partial
 from queue import Empty, SimpleQueue
@@ -14,10 +15,11 @@ import viser
 from PIL import Image
 
 from ir_maniskill import experiment as catalog
-from ir_maniskill.environment.robots.robot import available_robots, short_name
 from ir_maniskill.talk import cards
-from ir_maniskill.talk.session import PAPER, Session
+from ir_maniskill.talk.session import PAPER, Session, robots
 from ir_maniskill.talk.stage import Stage
+
+log = logging.getLogger(__name__)
 
 PICTURE, ROW = 224, 366
 """Height of the policy's pictures on the page, and width of their row [pixel]."""
@@ -25,6 +27,8 @@ GAP = 12
 """Between two pictures [pixel]."""
 BACKGROUND = 36
 """The panel's gray."""
+SPEEDS = (0.1, 2.0)
+"""How slow and how fast it may go; 1 is real time."""
 EXAMPLES = 9
 """Most examples that are shown."""
 
@@ -93,9 +97,18 @@ class Page:
         wished = False
         with contextlib.suppress(Empty):
             while True:
-                self._wishes.get_nowait()()
+                self.attempt(self._wishes.get_nowait())
                 wished = True
         return wished
+
+    def attempt(self, call: Callable[[], None]) -> None:
+        """Do something; if it fails, say so, and begin again in a new scene."""
+        try:
+            call()
+        except Exception as error:  # no visitor's wish may end the page for all
+            log.exception("talk: a wish failed")
+            self.session.new_scene()
+            self.session.note = f"That failed: {error}"
 
     # -- The panel ---------------------------------------------------------------------
 
@@ -106,7 +119,7 @@ class Page:
             gui.add_button("Say it", icon=viser.Icon.MESSAGE).on_click(
                 lambda _: form.submit()
             )
-        form.on_submit(lambda _: self._wish(self.session.tell, line.value))
+        form.on_submit(lambda _: self._wish(self.session.tell, str(line.value)))
         self._sentence = gui.add_html("")
         self._lights = gui.add_html("")
         self._pictures = gui.add_image(side_by_side([]), format="png")
@@ -126,8 +139,8 @@ class Page:
 
     def _add_time(self) -> None:
         gui = self.server.gui
-        speed = gui.add_slider("Speed", 0.1, 2.0, 0.1, 1.0)
-        speed.on_update(lambda _: setattr(self, "speed", float(speed.value)))
+        speed = gui.add_slider("Speed", *SPEEDS, 0.1, 1.0)
+        speed.on_update(lambda _: self._set_speed(float(speed.value)))
         buttons = gui.add_button_group("Scene", ("pause", "reset", "new scene"))
 
         @buttons.on_click
@@ -140,9 +153,12 @@ class Page:
                 case "new scene":
                     self._wish(self.session.new_scene)
 
+    def _set_speed(self, speed: float) -> None:
+        if speed > 0:  # else it is no number
+            self.speed = min(max(speed, SPEEDS[0]), SPEEDS[1])
+
     def _add_choice(self) -> None:
         gui, session = self.server.gui, self.session
-        robots = [short_name(uid) for uid in available_robots()]
         with gui.add_folder("The paper's experiments"):
             runs = gui.add_button_group("Run", ("I", "II", "III"))
             self._run = gui.add_html("")
@@ -154,7 +170,7 @@ class Page:
         with gui.add_folder("Choose"):
             self._choices: dict[str, Any] = {
                 "task": gui.add_dropdown("Task", catalog.available()),
-                "robot": gui.add_dropdown("Robot", robots),
+                "robot": gui.add_dropdown("Robot", robots()),
                 "policy": gui.add_dropdown("Policy", session.players()),
             }
         for kind, box in self._choices.items():

@@ -19,8 +19,9 @@ import torch
 from mani_skill.utils.structs import Actor
 
 from ir_maniskill import experiment as catalog
-from ir_maniskill.checks import require
+from ir_maniskill.checks import require, require_choice
 from ir_maniskill.environment.robots.nao import Nao
+from ir_maniskill.environment.robots.robot import available_robots, short_name
 from ir_maniskill.environment.senses import cameras
 from ir_maniskill.environment.table_scene import OBJECT_HEIGHT, TABLE_TOP
 from ir_maniskill.experiment import OBJECT_SIZE, TABLE, Spoken
@@ -38,6 +39,11 @@ APART = 1.25 * OBJECT_SIZE
 """How near an object may be dragged to another one, between centers [m]."""
 LASTS = 2
 """How long a run of an experiment gives each sentence [episodes]."""
+
+
+def robots() -> list[str]:
+    """Return the names of the robots that there are."""
+    return [short_name(uid) for uid in available_robots()]
 
 
 @dataclass(frozen=True)
@@ -149,19 +155,26 @@ class Session:
     # -- What is played ----------------------------------------------------------------
 
     def choose(self, **wanted: str) -> None:
-        """Change task, robot or policy, by name; what does not fit changes nothing."""
+        """Change task, robot or policy, by name; what does not fit changes nothing.
+
+        Names come from a page: only those that are there are looked up.
+        """
         choice = replace(self.choice, **wanted)
-        players = self.players(choice)
-        if "policy" in wanted:
-            self._random = choice.policy == RANDOM
-        else:
-            choice = replace(choice, policy=RANDOM if self._random else players[0])
         try:
-            if choice.policy not in players:
-                raise ValueError(f"{choice.policy} does not fit, try {players[0]}.")
+            require_choice("task", choice.task, catalog.available())
+            require_choice("robot", choice.robot, robots())
+            players = self.players(choice)
+            if "policy" not in wanted:
+                best = RANDOM if self._random else players[0]
+                choice = replace(choice, policy=best)
+            require_choice("policy", choice.policy, players)
             self._enter(choice)
         except ValueError as error:
             self.note = str(error)
+        else:
+            self._random = (
+                choice.policy == RANDOM if "policy" in wanted else self._random
+            )
 
     def players(self, choice: Choice | None = None) -> list[str]:
         """Return the names of what can move the robot in the task, the best first."""
