@@ -76,8 +76,9 @@ class Train:
     """Train an agent."""
 
     config: Annotated[TrainOptions, arg(name="")]
-    preset: Literal["default", "vision", "paper"] = "default"
-    """Which numbers to start from: ours, ours for pictures alone, the paper's."""
+    preset: Literal["default", "vision", "paper", "listen"] = "default"
+    """Which numbers to start from: ours, ours for pictures alone, the paper's, those
+    for many sentences (hindsight)."""
     resume: bool = False
     """Go on from the folder's last checkpoint, if there is one, with its own config."""
 

@@ -183,15 +183,10 @@ class SAC(Algorithm):
         """Judge an episode under several sentences, and add it to the replay."""
         scenes = Snapshot.unpack(episode["snapshot"], self.hindsight.fingers)
         (said,) = read_text(episode.pop("text")[:1])
-        found = self.hindsight.find(
-            scenes.rows(torch.zeros(1, dtype=torch.int64)), said
-        )
+        found = self.hindsight.find(scenes.rows(torch.tensor([0])), said)
         judged = self.hindsight.judge(scenes, found)
-        rows, sentences = (
-            len(scenes.contact),
-            self.hindsight.read(found, self._sentence),
-        )
-        first = not len(self.replay)
+        sentences = self.hindsight.read(found, self._sentence)
+        rows, first = len(scenes.contact), not len(self.replay)
         self.replay.add(
             episode
             | {name: each.expand(rows, *each.shape) for name, each in sentences.items()}
@@ -297,9 +292,8 @@ class SAC(Algorithm):
         self._step("critics", loss)
         with torch.no_grad():
             rate = self.config.polyak
-            torch._foreach_lerp_(
-                list(self.slow.parameters()), list(self.critics.parameters()), rate
-            )
+            slow, fast = self.slow.parameters(), self.critics.parameters()
+            torch._foreach_lerp_(list(slow), list(fast), rate)
         self._note(critics=loss, value=value.mean(), reward=now["reward"].mean())
 
     def _improve_agent(self, now: State) -> None:
@@ -323,9 +317,8 @@ class SAC(Algorithm):
         """Make one step of an optimizer; the others' weights get no gradient."""
         optimizer = self._optimizers[name]
         weights = [w for group in optimizer.param_groups for w in group["params"]]
-        for weight, gradient in zip(
-            weights, torch.autograd.grad(loss, weights), strict=True
-        ):
+        gradients = torch.autograd.grad(loss, weights)
+        for weight, gradient in zip(weights, gradients, strict=True):
             weight.grad = gradient
         optimizer.step()
 
