@@ -1,8 +1,10 @@
 """Checks of what is given, and the errors that they raise: got, expected, available."""
 
 import math
+import types
 import typing
 from collections.abc import Callable
+from functools import partial
 from numbers import Integral
 from typing import Any, Literal
 
@@ -56,10 +58,24 @@ def require_fields(
         require(fits(value), name, value, expected)
 
 
-def require_choices(config: object) -> None:
-    """Raise ConfigError unless the fields of Literal types have one of their values."""
+def require_types(config: object) -> None:
+    """Raise ConfigError unless fields of plain and Literal types have such values."""
     for name, hint in typing.get_type_hints(type(config)).items():
-        if typing.get_origin(hint) is Literal:
-            choices = typing.get_args(hint)
-            expected = "one of " + ", ".join(map(repr, choices))
-            require_fields(config, name, choices.__contains__, expected)
+        kinds, origin = typing.get_args(hint) or (hint,), typing.get_origin(hint)
+        if origin is Literal:
+            expected = "one of " + ", ".join(map(repr, kinds))
+            require_fields(config, name, kinds.__contains__, expected)
+        elif origin in (None, types.UnionType) and {*kinds} <= PLAIN:
+            expected = " or ".join(kind.__name__ for kind in kinds)
+            fits = partial(_is_one_of, kinds=kinds)
+            require_fields(config, name, fits, f"a value of type {expected}")
+
+
+PLAIN = {int, float, bool, str, types.NoneType}
+
+
+def _is_one_of(value: object, kinds: tuple[type, ...]) -> bool:
+    """Whether a value is of one of the types: integers are floats, truth no number."""
+    if isinstance(value, bool):
+        return bool in kinds
+    return isinstance(value, (*kinds, int) if float in kinds else kinds)

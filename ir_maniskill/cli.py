@@ -70,6 +70,11 @@ class TrainOptions(TrainConfig):
     out: str = ""
     """Folder of the run; runs/ID if empty."""
 
+    def __post_init__(self) -> None:
+        """Refuse values that cannot work, once it is known which task it is."""
+        if self.env_id is not tyro.MISSING:
+            super().__post_init__()
+
 
 @dataclasses.dataclass(frozen=True)
 class Train:

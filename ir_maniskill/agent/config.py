@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from ir_maniskill.checks import require, require_choices, require_fields
+from ir_maniskill.checks import require, require_fields, require_types
 from ir_maniskill.environment.senses import available
 from ir_maniskill.language.tokens import VOCABULARY
 
@@ -64,7 +64,7 @@ class AgentConfig:
             known = ", ".join(map(repr, available()))
             require(sense in available(), "senses", sense, f"one of {known}")
         require(self.senses != (), "senses", self.senses, "at least one, or None")
-        require_choices(self)
+        require_types(self)
         words, units = self.vocabulary, self.hidden
         require(len(words) > 1, "vocabulary", words, "<pad>, <unk> and words")
         fits = 1 <= len(units) <= 100 and min(units) > 0

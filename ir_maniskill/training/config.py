@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from ir_maniskill.agent.agent import asks
 from ir_maniskill.agent.config import AgentConfig, from_version_1, without_constants
-from ir_maniskill.checks import ConfigError, require, require_choices, require_fields
+from ir_maniskill.checks import ConfigError, require, require_fields, require_types
 from ir_maniskill.environment.reward_generator import RewardWeights
 
 ControlMode = Literal["pd_joint_target_delta_pos", "pd_joint_pos"]
@@ -63,6 +63,7 @@ class PPOConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
+        require_types(self)
         require_fields(self, "steps_per_update epochs", lambda x: x > 0, "at least 1")
         batch, total = self.minibatch, self.steps_per_update
         fits = batch is None or 2 <= batch <= total
@@ -173,7 +174,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
-        require_choices(self)
+        require_types(self)
         positive = "total_steps num_envs num_workers threads camera_height camera_width"
         positive += " frames eval_interval eval_episodes checkpoint_interval"
         require_fields(self, positive, lambda x: x is None or x > 0, "at least 1")
