@@ -54,6 +54,8 @@ BEHIND = 0.036
 """How far behind an object's center a push begins [m]."""
 LOW = TABLE_TOP + 0.03
 """Height of the fingertips when they push [m]."""
+SWEEP = 0.022
+"""How far ahead of the tip its aim is while it pushes [m]."""
 NEAR = 0.015
 """How near its way point is near enough [m]."""
 ASIDE = np.array([0.15, 0.20, 0.17])
@@ -391,14 +393,16 @@ class Scripted:
         act, mine = episode.acts.get(hand), [a.index for a in episode.acts.values()]
         if act is None:
             tips, mine = arm.tips[0], []
-            aim = view.aim(ASIDE * (1, arm.side, 1), mine)
+            lifted = episode.begun[hand] + (0, 0, 0.06)
+            wait = lifted if episode.steps <= LIFT else ASIDE * (1, arm.side, 1)
+            aim = view.aim(wait, mine)
             x = episode.idle.get(hand, now)
             x = episode.idle[hand] = arm.improve(x, tips, aim, 1)
         else:
             tips = act.tips
             found = self._way_point(arm, hand, act, view, now)
-            if found is None:
-                return None
+            if found is None:  # a push ends at once, a touch is held
+                return now if isinstance(act.goal, Push) else None
             tip, margin = found
             push = (
                 np.array(DIRECTIONS[act.goal.direction])
@@ -461,7 +465,9 @@ class Scripted:
             return np.append(behind[:2], top + OVER), 0.006
         if act.phase == 1:
             return np.append(behind[:2], LOW), 0.002
-        return np.append((place + 0.005 * along)[:2], LOW), -0.05
+        behind_it, beside = (tip - place) @ along, (tip - place) @ left
+        ahead_of_tip = min(0.005, behind_it + SWEEP) * along
+        return np.append((place + ahead_of_tip - beside * left)[:2], LOW), -0.05
 
     # -- Which hand does what ----------------------------------------------------------
 
