@@ -465,7 +465,7 @@ class Scripted:
             return np.append(behind[:2], top + OVER), 0.006
         if act.phase == 1:
             return np.append(behind[:2], LOW), 0.002
-        behind_it, beside = (tip - place) @ along, (tip - place) @ left
+        behind_it, beside = float((tip - place) @ along), (tip - place) @ left
         ahead_of_tip = min(0.005, behind_it + SWEEP) * along
         return np.append((place + ahead_of_tip - beside * left)[:2], LOW), -0.05
 
