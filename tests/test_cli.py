@@ -136,7 +136,7 @@ def test_an_unknown_instruction_lists_those_there_are(capsys, policy_file):
         (["video", IDS[0], "--seed", str(2**32 - 2)], "seed: got 4294967294"),
         (["evaluate", IDS[0], "--seed", str(2**32 - 100)], "seed: got 4294967196"),
         (["train", IDS[0], "--num-envs", "0"], "num_envs: got 0"),
-        (["train", IDS[0], "--preset", "fast"], "default, vision, paper"),
+        (["train", IDS[0], "--preset", "fast"], "default, listen, vision, paper"),
         (["curve", "/nowhere"], "/nowhere"),
         (["video", IDS[0], "--out", "/dev/null/film.mp4"], "cannot write /dev/null/f"),
         (["evaluate", IDS[0], "--json", "/dev"], "cannot write /dev: Is a directory"),
