@@ -15,7 +15,7 @@ A robot learns by reward alone to do what a sentence says.
   tasks      list the tasks, and the robots that can do them
   train      train an agent
   evaluate   play seeded episodes, and count
-  audit      does a policy look, does it read; with intervals
+  audit      ask whether a policy looks, reads, and copes with what is new
   video      film a policy (.mp4 or .gif)
   talk       open a page to talk to a robot, live
   curve      draw the learning curve of a run (.png)

@@ -55,7 +55,7 @@ def script(name: str) -> str:
 def test_train_knows_the_three_experiments_of_the_paper() -> None:
     example = runpy.run_path(script("train.py"))
     assert set(example["TASKS"].values()) <= set(available())
-    assert set(example["STEPS"]) == set(CONFIGS)
+    assert set(example["STEPS"]) == set(CONFIGS) - {"listen"}  # of many sentences
     for steps in example["STEPS"].values():
         assert set(steps) == set(example["TASKS"])
 

@@ -107,6 +107,7 @@ class SACConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
+        require_types(self)
         positive = "capacity first_steps batch gradients actor_every"
         require_fields(self, positive, lambda x: x > 0, "at least 1")
         require_fields(self, "random_steps others", lambda x: x >= 0, "0 or more")
