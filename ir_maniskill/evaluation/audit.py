@@ -7,6 +7,7 @@ the same scene. Legend: N envs, L tokens, I instructions.
 
 from __future__ import annotations
 
+import gc
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
@@ -22,6 +23,7 @@ from tqdm import tqdm
 
 from ir_maniskill.checks import require
 from ir_maniskill.environment.layout import layout_of
+from ir_maniskill.environment.robots import Nao
 from ir_maniskill.environment.senses import (
     TEXT_BYTES,
     Observation,
@@ -149,7 +151,7 @@ def _all_rows(
         yield [_row("who", "the policy", figures)]
         anyhow, _ = play(at_random(envs), envs, told, seeds)
         yield [_row("who", "random actions", anyhow)]
-        yield [_row("who", "the scripted solution", _scripted(task, told, seeds))]
+        yield [_row("who", "the scripted solution", _scripted(envs, told, seeds))]
         for name, score in score_by_name(figures, names).items():
             if score.success.total < episodes:
                 yield [Row("kind", name, score.success, score.exclusive)]
@@ -192,14 +194,23 @@ def at_random(envs: VectorEnv) -> Player:
 
 
 def _scripted(
-    task: Experiment, told: Sequence[int | None], seeds: Sequence[int]
+    envs: VectorEnv, told: Sequence[int | None], seeds: Sequence[int]
 ) -> Tensor:
-    """Return the figures of the scripted solution, which needs no pictures."""
-    with closing(blind(task)) as envs:
-        return play(Scripted(envs.base_env), envs, told, seeds)[0]
+    """Return the figures of the scripted solution, with the robot of the envs."""
+    with closing(blind(envs.experiment, robot_of(envs))) as alone:
+        gc.freeze()  # ManiSkill collects garbage whenever it rebuilds a scene
+        figures, _ = play(Scripted(alone.base_env), alone, told, seeds)
+        gc.unfreeze()
+        return figures
 
 
-def blind(task: Experiment) -> GpuVectorEnv:
+def robot_of(envs: VectorEnv) -> str:
+    """Return the uid of the robot in these envs."""
+    found = envs.get_attr("robot_uids")  # of N envs, or of N vectors of one
+    return found if isinstance(found, str) else found[0]
+
+
+def blind(task: Experiment, robot: str = Nao.uid) -> GpuVectorEnv:
     """Return one env of this process, without pictures."""
     return GpuVectorEnv(
         task.id,
@@ -208,6 +219,7 @@ def blind(task: Experiment) -> GpuVectorEnv:
         render_backend="none",
         obs_mode="state_dict",
         control_mode="pd_joint_target_delta_pos",
+        robot_uids=robot,
     )
 
 
@@ -313,7 +325,7 @@ def same_scene(player: Player, envs: VectorEnv, *, scenes: int, seed: int) -> li
         ValueError: No scenes.
     """
     require(scenes >= 1, "scenes", scenes, "at least 1")
-    pairs = list(_told_in_each(envs.experiment, range(seed, seed + scenes)))
+    pairs = list(_told_in_each(envs, range(seed, seed + scenes)))
     if not pairs:
         return []
     seeds, told = zip(*pairs, strict=True)
@@ -328,16 +340,17 @@ def same_scene(player: Player, envs: VectorEnv, *, scenes: int, seed: int) -> li
 
 
 def _told_in_each(
-    task: Experiment, seeds: Sequence[int]
+    envs: VectorEnv, seeds: Sequence[int]
 ) -> Iterator[tuple[int, int | Instruction]]:
     """Yield each scene's seed with each of its sentences."""
-    if task.sentences:
-        yield from ((s, i) for i in range(len(task.sentences)) for s in seeds)
+    count = len(envs.experiment.sentences)
+    if count:
+        yield from ((seed, index) for index in range(count) for seed in seeds)
         return
-    with closing(blind(task)) as envs:
+    with closing(blind(envs.experiment, robot_of(envs))) as alone:
         for seed in seeds:
-            said = _sentences(envs, seed)
-            yield from ((seed, i) for i in said if len(said) > 1)
+            said = _sentences(alone, seed)
+            yield from ((seed, one) for one in said if len(said) > 1)
 
 
 def _sentences(envs: GpuVectorEnv, seed: int) -> list[Instruction]:

@@ -118,8 +118,11 @@ class Arm:
         self._low = robot.controller.lower.cpu().numpy().astype(float)
         self._high = robot.controller.upper.cpu().numpy().astype(float)
         parts = [[n for n in reversed(chain) if n in distal] for chain in chains]
-        self._parts = [[names.index(n) for n in part] for part in parts]
-        self._palm, self._elbow = names.index(palm), names.index(upper[1])
+        self._links = [
+            names.index(n) for n in (*itertools.chain(*parts), palm, upper[1])
+        ]
+        count = np.cumsum([len(part) for part in parts])
+        self._first, self._last = count - [len(part) for part in parts], count - 1
         self.shoulder = articulation.links_map[moved[self.joints[0]]].pose.p[0].cpu()
         self.shoulder = self.shoulder.numpy().astype(float) / self.scale
         self.side = 1.0 if self.shoulder[1] >= 0 else -1.0
@@ -148,22 +151,18 @@ class Arm:
         qpos = np.empty(len(self.rest))
         qpos[self._order] = self.to_joints(x, self.rest)
         self._model.compute_forward_kinematics(qpos)
-        parts = [np.array([self._at(i) for i in part]) for part in self._parts]
-        tip = sum(parts[i][-1] for i in tips) / len(tips)
-        palm, elbow = self._at(self._palm), self._at(self._elbow)
-        knuckles = sum(part[0] for part in parts[:2]) / len(parts[:2])
-        ends = [
-            part[-1] + 0.7 * (part[-1] - part[-2]) for part in parts if len(part) > 1
-        ]
-        solid = [palm + f * (knuckles - palm) for f in (0.2, 0.5, 0.8)]
-        solid += [elbow + f * (palm - elbow) for f in (0.3, 0.7)]
-        across = parts[1 % len(parts)][-1] - parts[0][-1]
-        balls = np.concatenate([*parts, *([ends] if ends else []), solid])
+        links = np.array([self._model.get_link_pose(i).p for i in self._links])
+        links = (links @ self._mount[:3, :3].T + self._mount[:3, 3]) / self.scale
+        fingers, palm, elbow = links[:-2], links[-2], links[-1]
+        ends = fingers[self._last]
+        tip = ends[list(tips)].mean(axis=0)
+        knuckles = fingers[self._first[:2]].mean(axis=0)
+        pads = ends + 0.7 * (ends - fingers[np.maximum(self._last - 1, self._first)])
+        solid = palm + np.outer((0.2, 0.5, 0.8), knuckles - palm)
+        solid = np.concatenate([solid, elbow + np.outer((0.3, 0.7), palm - elbow)])
+        across = ends[1 % len(ends)] - ends[0]
+        balls = np.concatenate([fingers, pads, solid])
         return Hand(tip, _unit(tip - palm), _unit(across), balls)
-
-    def _at(self, link: int) -> Array:
-        place = self._mount[:3, :3] @ self._model.get_link_pose(link).p
-        return (place + self._mount[:3, 3]) / self.scale
 
     def _radii(self, balls: Array) -> Array:
         fingers = np.arange(balls.shape[-2]) < balls.shape[-2] - 5
@@ -202,11 +201,15 @@ class Arm:
         first, damping, small = x, 0.02, 1e-4
         r = self._residual(x, tips, aim, first)
         for _ in range(steps):
+            if r @ r < 1e-6:
+                break
             moved = [x + small * unit for unit in np.eye(len(x))]
             rows = [(self._residual(m, tips, aim, first) - r) / small for m in moved]
             jacobian = np.array(rows).T
             square = jacobian.T @ jacobian + damping * np.eye(len(x))
             step = -np.linalg.solve(square, jacobian.T @ r)
+            if np.abs(step).max() < 1e-3:
+                break
             new = np.clip(x + np.clip(step, -0.3, 0.3), low, high)
             less = self._residual(new, tips, aim, first)
             if less @ less < r @ r:
@@ -465,9 +468,10 @@ class Scripted:
             return np.append(behind[:2], top + OVER), 0.006
         if act.phase == 1:
             return np.append(behind[:2], LOW), 0.002
-        behind_it, beside = float((tip - place) @ along), (tip - place) @ left
-        ahead_of_tip = min(0.005, behind_it + SWEEP) * along
-        return np.append((place + ahead_of_tip - beside * left)[:2], LOW), -0.05
+        behind_it, beside = (tip - place) @ along, (tip - place) @ left
+        onward = min(0.005, float(behind_it) + SWEEP)
+        aim = place + onward * along - beside * left
+        return np.append(aim[:2], LOW), -0.05
 
     # -- Which hand does what ----------------------------------------------------------
 
