@@ -78,8 +78,8 @@ class ToyVectorEnv:
 
     def reset(self, *, seed=None, options=None):
         if seed is not None:
-            rows = range(self.num_envs)
-            self.streams = [np.random.default_rng(seed + i) for i in rows]
+            each = seed if isinstance(seed, list) else range(seed, seed + self.num_envs)
+            self.streams = [np.random.default_rng(one) for one in each]
         self._start(torch.ones(self.num_envs, dtype=torch.bool))
         if options:
             self.told[:] = torch.tensor(options["instruction"])
