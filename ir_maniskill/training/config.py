@@ -92,7 +92,7 @@ class SACConfig:
     any of its sentences."""
     batch: int = 256
     """Steps of each gradient, rounded up to whole episodes' share."""
-    each: int = 4
+    each: int = 2
     """Steps of a gradient that are of one episode, under one sentence: as reading takes
     as long as seeing, they share it."""
     gradients: int = 2
@@ -110,8 +110,10 @@ class SACConfig:
     facts_weight: float = 0.1
     """Weight of the loss that asks the Language System what the goal is; 0: none."""
     reading_steps: int = 300
-    """Gradients of that loss alone before others, since who cannot read learns little
+    """Gradients of that loss alone, before any other: who cannot read learns little
     from pictures."""
+    looking_steps: int = 300
+    """Gradients of the auxiliary losses alone, after these."""
     polyak: float = 0.005
     """How far the slow critics follow at each gradient."""
 
@@ -119,7 +121,7 @@ class SACConfig:
         """Refuse values that cannot work."""
         positive = "capacity first_steps batch each gradients actor_every"
         require_fields(self, positive, lambda x: x > 0, "at least 1")
-        unsigned = "random_steps others facts_weight reading_steps"
+        unsigned = "random_steps others facts_weight reading_steps looking_steps"
         require_fields(self, unsigned, lambda x: x >= 0, "0 or more")
         require_fields(self, "gamma own polyak", lambda x: 0 <= x <= 1, "0 to 1")
         above = "learning_rate encoder_rate reward_scale"
@@ -256,7 +258,7 @@ CONFIGS: dict[str, TrainConfig] = {
             actor="squashed",
             critic="none",
             language_length=40,
-            auxiliary_weight=2.0,
+            auxiliary_weight=10.0,
         ),
     ),
     "vision": TrainConfig(

@@ -222,6 +222,9 @@ class SAC(Algorithm):
             return {}
         if not self.updates:
             self._learn_to_read()
+            for _ in range(self.config.looking_steps):
+                now = self._draw()
+                self._step("agent", self._auxiliary(self.agent.encoder(now), now))
         self.updates += 1
         for turn in range(self.config.gradients):
             now = self._draw()
@@ -325,6 +328,15 @@ class SAC(Algorithm):
         action, log_prob = self.agent.actor(aligned).rsample()
         value = self.critics(self._known(now), action).amin(dim=0)
         loss = (temperature * log_prob - value).mean()
+        loss = loss + self._auxiliary(aligned, now)
+        self._step("agent", loss)
+        excess = 0.5 * self.actions - log_prob.detach().mean()  # entropy over -A/2
+        self._step("temperature", self.log_temperature.exp() * excess)
+        self._note(entropy=-log_prob.mean(), temperature=temperature)
+
+    def _auxiliary(self, aligned: Tensor, now: State) -> Tensor:
+        """Return the weighted losses of what B_t should tell: facts, and a place."""
+        loss = torch.zeros(())
         if self.agent.locator is not None:
             guess, truth = self.agent.locator(aligned), now["named"]
             off = 2 * functional.huber_loss(guess / LENGTH, truth / LENGTH)
@@ -335,10 +347,7 @@ class SAC(Algorithm):
             unread = self._unread(said, now["facts"])
             loss = loss + self.config.facts_weight * unread
             self._note(unread=unread)
-        self._step("agent", loss)
-        excess = 0.5 * self.actions - log_prob.detach().mean()  # entropy over -A/2
-        self._step("temperature", self.log_temperature.exp() * excess)
-        self._note(entropy=-log_prob.mean(), temperature=temperature)
+        return loss
 
     def _learn_to_read(self) -> None:
         """Learn to tell from the sentences alone what the goals are."""
