@@ -10,7 +10,7 @@ from ir_maniskill.environment.reward_generator import RewardWeights
 from ir_maniskill.goals import Avoid, Both, Instruction, Push, Ref, Then, Touch
 from ir_maniskill.snapshot import Snapshot
 from ir_maniskill.training.config import CONFIGS
-from ir_maniskill.training.hindsight import Hindsight
+from ir_maniskill.training.hindsight import FACTS, Hindsight, facts
 
 HANDS = {"left": ("a", "b", "c"), "right": ("d", "e", "f")}
 SHUFFLED = catalog.get("NaoTouchCubeShuffled-v1")
@@ -69,6 +69,15 @@ def test_critics_are_told_of_every_kind_of_goal_in_as_many_numbers() -> None:
     goal = sparse().judge(joined(scene(), scene((0, 1))), told(*goals)).goal
     assert goal.shape[:2] == (2, 4)
     assert len(torch.unique(goal[0], dim=0)) == 4, "two goals look the same"
+
+
+def test_facts_tell_goals_apart_and_not_how_they_are_said() -> None:
+    red, blue = Ref("red"), Ref("blue", "cube")
+    goals = Touch(red), Touch(blue), Touch(red, "left"), Push(red, "left"), Avoid(red)
+    told = [frozenset(facts(goal)) for goal in (*goals, Both(Touch(red), Touch(blue)))]
+    assert len(set(told)) == len(told)
+    assert facts(Touch(Ref("red"))) == facts(Touch(red))
+    assert all(0 <= fact < FACTS for each in told for fact in each)
 
 
 def test_a_listed_task_is_judged_under_its_own_sentences() -> None:

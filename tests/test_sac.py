@@ -117,6 +117,23 @@ def collected(tmp_path, envs, episodes=4):
     return algorithm
 
 
+def test_the_language_system_can_be_asked_what_the_goal_is(tmp_path) -> None:
+    algorithm = collected(tmp_path, ToyVectorEnv(snapshots=True))
+    algorithm.config = dataclasses.replace(algorithm.config, reading_steps=80)
+    drawn = algorithm._draw()
+
+    def unread():
+        with torch.no_grad():
+            return algorithm._unread(
+                algorithm.agent.encoder.read(drawn), drawn["facts"]
+            )
+
+    before = unread()
+    algorithm._learn_to_read()
+    # Two sentences differ in one fact of two: guessing costs log 2 for each of these.
+    assert unread() < 2 * 0.69 < before
+
+
 def test_every_episode_is_kept_whole(tmp_path) -> None:
     algorithm = collected(tmp_path, ToyVectorEnv(4, snapshots=True), episodes=3)
     assert algorithm.replay.episodes == 4 * 3

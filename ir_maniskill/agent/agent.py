@@ -121,7 +121,7 @@ class StateEncoder(nn.Module):
         if self.felt:
             inputs = sum(math.prod(spec.shapes[name]) for name in self.felt)
             self.body = BodySense(inputs, normalize=config.vision != "paper")
-        self.width = width  # of B_t
+        self.reading_width = self.width = width  # of G_t, and below of B_t
         if self.vision is not None:
             cell = config.vision == "cells"
             self.width += cell_vision.WIDTH if cell else VISION_WIDTH
@@ -139,15 +139,18 @@ class StateEncoder(nn.Module):
 
     def forward(self, state: State) -> Tensor:
         """Return B_t [N, D] = [G_t, V_t, H_t]."""
-        said = self.language(*(state[name] for name in self.language.reads))
-        if self.reading is not None:
-            said = self.reading(said)
+        said = self.read(state)
         embeddings = [said]
         if self.vision is not None:
             embeddings.append(self.vision(state["images"], said))
         if self.body is not None:
             embeddings.append(self.body(*(self._sense(state, k) for k in self.felt)))
         return self.alignment(*embeddings)
+
+    def read(self, state: State) -> Tensor:
+        """Return G_t [N, D'] alone."""
+        said: Tensor = self.language(*(state[name] for name in self.language.reads))
+        return said if self.reading is None else self.reading(said)
 
     def _sense(self, state: State, name: str) -> Tensor:
         if name == "privileged" and self.standardize is not None:

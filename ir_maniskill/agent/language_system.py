@@ -19,6 +19,8 @@ from ir_maniskill.environment.senses import read_text
 from ir_maniskill.language.lexicon import Lexicon, lexicon
 from ir_maniskill.language.tokens import PAD
 
+LIKE = 32
+"""Sentences that are encoded together."""
 LAYERS, HEADS, WIDTH = 3, 2, 50
 """Of the paper's transformer: its layers, their heads, and D."""
 
@@ -115,13 +117,17 @@ class TokenTransformer(LanguageEncoder):
     def forward(self, instruction: Tensor) -> Tensor:
         """Return G_t [N, width] of the token ids [N, L].
 
-        A batch repeats few sentences many times, so each is encoded only once.
+        A batch repeats few sentences many times, so each is encoded only once; many
+        are encoded with others of like length, since padding takes as long as words.
 
         Raises:
             ValueError: A sentence is too long, or has ids that no word has.
         """
         sentences, which = torch.unique(instruction, dim=0, return_inverse=True)
-        return self._encode(self._fitting(sentences)).index_select(0, which)
+        order = (sentences != PAD).sum(dim=1).argsort()
+        parts = sentences[order].tensor_split(max(1, len(order) // LIKE))
+        encoded = torch.cat([self._encode(self._fitting(part)) for part in parts])
+        return encoded.index_select(0, order.argsort()[which])
 
     def _fitting(self, sentences: Tensor) -> Tensor:
         """Return the sentences [M, L] without the padding that all of them have."""

@@ -91,7 +91,10 @@ class SACConfig:
     """Share of the steps that are learned from under what was said; the rest is under
     any of its sentences."""
     batch: int = 256
-    """Steps of each gradient."""
+    """Steps of each gradient, rounded up to whole episodes' share."""
+    each: int = 2
+    """Steps of a gradient that are of one episode, under one sentence: as reading takes
+    as long as seeing, they share it."""
     gradients: int = 2
     """Gradients of the critics for each step of all envs."""
     actor_every: int = 2
@@ -102,17 +105,27 @@ class SACConfig:
     """Discount of a step."""
     reward_scale: float = 0.2
     """Factor of rewards, beside which entropy counts."""
+    encoder_rate: float = 1e-3
+    """The same for what reads, sees and feels, which has the auxiliary losses too."""
+    facts_weight: float = 0.1
+    """Weight of the loss that asks the Language System what the goal is; 0: none."""
+    reading_steps: int = 300
+    """Gradients of that loss alone, before any other: who cannot read learns little
+    from pictures."""
+    looking_steps: int = 300
+    """Gradients of the auxiliary losses alone, after these."""
     polyak: float = 0.005
     """How far the slow critics follow at each gradient."""
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
         require_types(self)
-        positive = "capacity first_steps batch gradients actor_every"
+        positive = "capacity first_steps batch each gradients actor_every"
         require_fields(self, positive, lambda x: x > 0, "at least 1")
-        require_fields(self, "random_steps others", lambda x: x >= 0, "0 or more")
+        unsigned = "random_steps others facts_weight reading_steps looking_steps"
+        require_fields(self, unsigned, lambda x: x >= 0, "0 or more")
         require_fields(self, "gamma own polyak", lambda x: 0 <= x <= 1, "0 to 1")
-        above = "learning_rate reward_scale"
+        above = "learning_rate encoder_rate reward_scale"
         require_fields(self, above, lambda x: 0 < x < math.inf, "more than 0")
 
 
@@ -246,7 +259,7 @@ CONFIGS: dict[str, TrainConfig] = {
             actor="squashed",
             critic="none",
             language_length=40,
-            auxiliary_weight=2.0,
+            auxiliary_weight=10.0,
         ),
     ),
     "vision": TrainConfig(

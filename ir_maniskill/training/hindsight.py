@@ -8,9 +8,12 @@ Legend: R = T + 1 rows of an episode of T steps, M sentences, F fingers, C objec
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import dataclasses
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from random import Random
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,7 +27,7 @@ from ir_maniskill.environment.robots.robot import available_robots, find_robot
 from ir_maniskill.environment.senses import text_of, tokens_of
 from ir_maniskill.environment.speaker import Speaker
 from ir_maniskill.experiment import Experiment, Spoken
-from ir_maniskill.goals import SHAPES, Instruction, Measure
+from ir_maniskill.goals import SHAPES, Goal, Instruction, Measure
 from ir_maniskill.language import parse, things
 from ir_maniskill.snapshot import Snapshot
 from ir_maniskill.training.config import TrainConfig
@@ -112,9 +115,16 @@ class Hindsight:
     def read(
         self, instructions: Sequence[Instruction], entries: Mapping[str, int]
     ) -> dict[str, Tensor]:
-        """Return the sentences as a state has them [M, ...], in entries so long."""
+        """Return the sentences as a state has them [M, ...], in entries so long.
+
+        Beside them are the `facts` of what they ask for, padded with `FACTS`.
+        """
         texts = [instruction.text for instruction in instructions]
-        read: dict[str, Tensor] = {}
+        asked = [
+            sorted(facts(instruction.goal))[:MOST_FACTS] for instruction in instructions
+        ]
+        padded = [row + [FACTS] * (MOST_FACTS - len(row)) for row in asked]
+        read = {"facts": torch.tensor(padded, dtype=torch.int16)}
         if "instruction" in entries:
             words, length = self.experiment.vocabulary, entries["instruction"]
             read["instruction"] = tokens_of(texts, words, length).to(torch.int16)
@@ -192,6 +202,30 @@ def _middle(values: Tensor, measure: Measure) -> Tensor:
     """Return the mean over the objects that a goal asks about [N, C, 3] -> [N, 3]."""
     named = measure.serves.any(dim=1)[..., None]  # [N, C, 1]
     return (values * named).sum(dim=1) / named.sum(dim=1).clamp(min=1)
+
+
+# -- What sentences ask for ------------------------------------------------------------
+
+FACTS, MOST_FACTS = 512, 32
+"""Numbers that facts have, and how many of a goal's are kept."""
+
+
+def facts(goal: Goal) -> set[int]:
+    """Return what a goal says as numbers below `FACTS`, one for each field's value.
+
+    Numbers are hashes, so this does for any kind of goal; that two facts share one is
+    rare, and does little harm.
+    """
+    return {zlib.crc32(fact.encode()) % FACTS for fact in _told(goal, "goal")}
+
+
+def _told(value: Any, path: str) -> Iterator[str]:
+    if not dataclasses.is_dataclass(value):
+        yield f"{path} {value}"
+        return
+    yield f"{path} {type(value).__name__}"
+    for field in dataclasses.fields(value):
+        yield from _told(getattr(value, field.name), f"{path}.{field.name}")
 
 
 # -- What critics read -----------------------------------------------------------------

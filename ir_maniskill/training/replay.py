@@ -17,8 +17,9 @@ from torch import Tensor
 Rows = dict[str, Tensor]
 """Tensors by name [N, ...]."""
 
-EPISODE, AGE = "replay.episode", "replay.age"
-"""Of each row: its episode's number (-1: being written), and which step of that."""
+EPISODE, AGE, LENGTH = "replay.episode", "replay.age", "replay.length"
+"""Of each row: its episode's number (-1: being written), which step of that it is, and
+how many there are."""
 
 
 class Replay:
@@ -65,6 +66,7 @@ class Replay:
         for name, rows in episode.items():
             self._rows[name][where] = rows.to(self._rows[name].dtype)
         self._rows[AGE][where] = torch.arange(count)
+        self._rows[LENGTH][where] = count - 1
         self._rows[EPISODE][where] = self.episodes
         self.written += count
         self.episodes += 1
@@ -74,7 +76,7 @@ class Replay:
         if self._rows:
             return
         layout = {name: (rows.dtype, rows.shape[1:]) for name, rows in like.items()}
-        layout |= {name: (torch.int64, torch.Size()) for name in (EPISODE, AGE)}
+        layout |= {name: (torch.int64, torch.Size()) for name in (EPISODE, AGE, LENGTH)}
         if self._folder is not None:
             self._folder.mkdir(parents=True, exist_ok=True)
             shapes = {
@@ -96,15 +98,28 @@ class Replay:
 
     # -- Reading ---------------------------------------------------------------------
 
-    def draw(self, count: int) -> Tensor:
-        """Return rows at random that have a next one [N] int64."""
+    def draw(self, episodes: int, each: int = 1) -> Tensor:
+        """Return rows at random that have a next one, so many of each episode drawn.
+
+        Episodes are as likely as they are long: [episodes * each] int64.
+        """
         found = torch.empty(0, dtype=torch.int64)
-        while len(found) < count:
-            rows = torch.randint(len(self), (2 * count,))
-            episode = self._rows[EPISODE]
-            steps = episode[rows] == episode[self.after(rows)]
-            found = torch.cat([found, rows[steps & (episode[rows] >= 0)]])
-        return found[:count]
+        while len(found) < episodes:
+            rows = torch.randint(len(self), (2 * episodes,))
+            found = torch.cat([found, rows[self._whole(rows)]])
+        first = found[:episodes] - self._rows[AGE][found[:episodes]]
+        uniform = torch.rand(each, episodes)
+        step = (uniform * self._rows[LENGTH][found[:episodes]]).long()
+        return ((first + step) % self.capacity).flatten()
+
+    def _whole(self, rows: Tensor) -> Tensor:
+        """Return which rows have a next one, and all of their episode is there [N]."""
+        number, age = self._rows[EPISODE], self._rows[AGE][rows]
+        ends = rows - age, rows - age + self._rows[LENGTH][rows]
+        there = [number[end % self.capacity] == number[rows] for end in ends]
+        return (
+            there[0] & there[1] & (age < self._rows[LENGTH][rows]) & (number[rows] >= 0)
+        )
 
     def after(self, rows: Tensor) -> Tensor:
         """Return the rows that come next [N]."""

@@ -36,13 +36,15 @@ from ir_maniskill.training.algorithm import (
 )
 from ir_maniskill.training.config import SACConfig, TrainConfig
 from ir_maniskill.training.finite import check_finite
-from ir_maniskill.training.hindsight import LENGTH, Hindsight, simulated
+from ir_maniskill.training.hindsight import FACTS, LENGTH, Hindsight, simulated
 from ir_maniskill.training.replay import Replay
 
 log = logging.getLogger(__name__)
 
 TEMPERATURE = 0.1
 """Weight of the entropy at the start."""
+READING_RATE, RARE = 3e-3, -5.0
+"""Adam's step size while only reading is learned; logit of a fact at the start."""
 LOGGED = 64
 """Updates from one row of the log to the next."""
 WIDTHS = (384, 384)
@@ -111,8 +113,11 @@ class SAC(Algorithm):
         self.critics = Critics(inputs + actions)
         self.slow = copy.deepcopy(self.critics).requires_grad_(False)
         self.log_temperature = torch.tensor(math.log(TEMPERATURE), requires_grad=True)
+        self.asked = nn.Linear(self.agent.encoder.reading_width, FACTS)
+        """Tells from G_t what the goal is; most facts are not true at first."""
+        nn.init.constant_(self.asked.bias, RARE)
         self._optimizers = {
-            "agent": self._adam(self.agent.parameters()),
+            "agent": self._adam_of_agent(),
             "critics": self._adam(self.critics.parameters()),
             "temperature": self._adam([self.log_temperature]),
         }
@@ -126,6 +131,14 @@ class SAC(Algorithm):
 
     def _adam(self, weights: Iterable[Tensor]) -> torch.optim.Adam:
         return torch.optim.Adam(list(weights), self.config.learning_rate, fused=True)
+
+    def _adam_of_agent(self) -> torch.optim.Adam:
+        encoder = [*self.agent.encoder.parameters(), *self.asked.parameters()]
+        others = [self.agent.actor, self.agent.locator]
+        weights = [w for part in others if part is not None for w in part.parameters()]
+        groups = [{"params": encoder, "lr": self.config.encoder_rate}]
+        groups += [{"params": weights, "lr": self.config.learning_rate}]
+        return torch.optim.Adam(groups, fused=True)
 
     def _use_16_bits(self) -> None:
         """Compute pictures' maps in 16 bits where the processor does so at speed."""
@@ -207,6 +220,11 @@ class SAC(Algorithm):
         """Make some gradients, once there is enough to learn from."""
         if self.replay.written < self.config.first_steps:
             return {}
+        if not self.updates:
+            self._learn_to_read()
+            for _ in range(self.config.looking_steps):
+                now = self._draw()
+                self._step("agent", self._auxiliary(self.agent.encoder(now), now))
         self.updates += 1
         for turn in range(self.config.gradients):
             now = self._draw()
@@ -228,13 +246,16 @@ class SAC(Algorithm):
 
         What was there after the step is named "next.", as what was before it is named.
         """
-        replay, batch = self.replay, self.config.batch
-        rows = replay.draw(batch)
-        which = torch.randint(self.hindsight.sentences, (batch,))
-        which[torch.rand(batch) < self.config.own] = 0
+        replay, each = self.replay, self.config.each
+        episodes = -(-self.config.batch // each)
+        rows = replay.draw(episodes, each)
+        which = torch.randint(self.hindsight.sentences, (episodes,))
+        which[torch.rand(episodes) < self.config.own] = 0
+        which = which.repeat(each)  # a sentence is read once, whatever is done under it
         drawn = self._read(rows, which) | {"action": replay.read("action", rows)}
         after = replay.after(rows)
         drawn |= {f"next.{k}": v for k, v in self._read(after, which).items()}
+        drawn["facts"] = replay.read("facts", rows, column=which)
         drawn["reward"] = replay.read("reward", after, column=which)
         drawn["terminal"] = replay.read("terminal", after)
         return drawn
@@ -243,15 +264,19 @@ class SAC(Algorithm):
         replay, frames = self.replay, self.frames
         sensed = self.agent.encoder.sensed
         read = {name: replay.read(name, rows, frames=frames) for name in sensed}
-        for name in self._sentence:
-            sentence = replay.read(name, rows, column=which)
-            read[name] = sentence.long() if name == "instruction" else sentence
+        read |= self._sentences(rows, which)
         for name in ("proprioception", "target"):
             read[f"now.{name}"] = replay.read(name, rows)
         for name in ("joint_velocity", "snapshot"):
             read[name] = replay.read(name, rows)
         for name in ("goal", "named"):
             read[name] = replay.read(name, rows, column=which).float()
+        return read
+
+    def _sentences(self, rows: Tensor, which: Tensor) -> State:
+        read = {k: self.replay.read(k, rows, column=which) for k in self._sentence}
+        if "instruction" in read:
+            read["instruction"] = read["instruction"].long()
         return read
 
     def _known(self, read: State) -> Tensor:
@@ -303,21 +328,54 @@ class SAC(Algorithm):
         action, log_prob = self.agent.actor(aligned).rsample()
         value = self.critics(self._known(now), action).amin(dim=0)
         loss = (temperature * log_prob - value).mean()
-        if self.agent.locator is not None:
-            guess, truth = self.agent.locator(aligned), now["named"]
-            off = 2 * functional.huber_loss(guess / LENGTH, truth / LENGTH)
-            loss = loss + self.agent.config.auxiliary_weight * off
-            self._note(auxiliary=off)
+        loss = loss + self._auxiliary(aligned, now)
         self._step("agent", loss)
         excess = 0.5 * self.actions - log_prob.detach().mean()  # entropy over -A/2
         self._step("temperature", self.log_temperature.exp() * excess)
         self._note(entropy=-log_prob.mean(), temperature=temperature)
 
+    def _auxiliary(self, aligned: Tensor, now: State) -> Tensor:
+        """Return the weighted losses of what B_t should tell: facts, and a place."""
+        loss = torch.zeros(())
+        if self.agent.locator is not None:
+            guess, truth = self.agent.locator(aligned), now["named"]
+            off = 2 * functional.huber_loss(guess / LENGTH, truth / LENGTH)
+            loss = loss + self.agent.config.auxiliary_weight * off
+            self._note(auxiliary=off)
+        if self.config.facts_weight > 0:
+            said = aligned[:, : self.agent.encoder.reading_width]
+            unread = self._unread(said, now["facts"])
+            loss = loss + self.config.facts_weight * unread
+            self._note(unread=unread)
+        return loss
+
+    def _learn_to_read(self) -> None:
+        """Learn to tell from the sentences alone what the goals are."""
+        encoder = self.agent.encoder
+        parts = (encoder.language, encoder.reading, self.asked)
+        weights = [w for part in parts if part is not None for w in part.parameters()]
+        optimizer = torch.optim.Adam(weights, READING_RATE, fused=True)
+        for _ in range(self.config.reading_steps):
+            rows = self.replay.draw(self.config.batch)
+            which = torch.randint(self.hindsight.sentences, rows.shape)
+            said = encoder.read(self._sentences(rows, which))
+            optimizer.zero_grad()
+            self._unread(said, self.replay.read("facts", rows, column=which)).backward()
+            optimizer.step()
+
+    def _unread(self, said: Tensor, facts: Tensor) -> Tensor:
+        """Return the cross-entropy of the facts [B, n] given G_t [B, D'], summed."""
+        true = torch.zeros(len(facts), FACTS + 1).scatter_(1, facts.long(), 1.0)
+        told = self.asked(said)
+        return functional.binary_cross_entropy_with_logits(
+            told, true[:, :FACTS], reduction="sum"
+        ) / len(facts)
+
     def _step(self, name: str, loss: Tensor) -> None:
         """Make one step of an optimizer; the others' weights get no gradient."""
         optimizer = self._optimizers[name]
         weights = [w for group in optimizer.param_groups for w in group["params"]]
-        gradients = torch.autograd.grad(loss, weights)
+        gradients = torch.autograd.grad(loss, weights, allow_unused=True)
         for weight, gradient in zip(weights, gradients, strict=True):
             weight.grad = gradient
         optimizer.step()
@@ -343,6 +401,7 @@ class SAC(Algorithm):
             "agent": self.agent.state_dict(),
             "critics": self.critics.state_dict(),
             "slow": self.slow.state_dict(),
+            "asked": self.asked.state_dict(),
             "replay": self.replay.state_dict(),
         }
 
@@ -351,6 +410,7 @@ class SAC(Algorithm):
         self.agent.load_state_dict(under("agent", tensors))
         self.critics.load_state_dict(under("critics", tensors))
         self.slow.load_state_dict(under("slow", tensors))
+        self.asked.load_state_dict(under("asked", tensors))
         self.replay.load_state_dict(under("replay", tensors))
         for name, optimizer in self._optimizers.items():
             load_averages(optimizer, under(f"optimizer.{name}", tensors))
