@@ -101,12 +101,12 @@ class SACConfig:
     """Gradients of the critics for one of the actor."""
     learning_rate: float = 3e-4
     """Adam's step size."""
+    encoder_rate: float = 1e-3
+    """The same for what reads, sees and feels, which has the auxiliary losses too."""
     gamma: float = 0.95
     """Discount of a step."""
     reward_scale: float = 0.2
     """Factor of rewards, beside which entropy counts."""
-    encoder_rate: float = 1e-3
-    """The same for what reads, sees and feels, which has the auxiliary losses too."""
     facts_weight: float = 0.1
     """Weight of the loss that asks the Language System what the goal is; 0: none."""
     reading_steps: int = 300
