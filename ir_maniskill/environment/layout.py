@@ -25,15 +25,16 @@ NAMED_FIRST = 2
 # What a hand can do, as found with NAO's scripted solution: `evaluation/scripted.py`.
 ACROSS = 0.04
 """How far past the middle line a hand touches [m]."""
-INNER = 0.145 / 0.255
+INNER = 0.165 / 0.255
 """Nearest to its shoulder that a fingertip pushes, as a share of the reach."""
-BEHIND, AT_END = 0.036, 0.023
+BEHIND, AT_END = 0.036, 0.034
 """Where the fingertip is when a push begins, behind the object's place, and when it
 ends, beyond that [m]."""
 PUSHES = {"outward": (0.05, math.inf), "inward": (0.02, 0.19), "away": (0.02, math.inf)}
 """How far to the hand's own side the object may lie (least, most) [m]."""
-FREE_AHEAD, FREE_BEHIND = 0.06, 0.05
-"""Distance of others from where a pushed object goes, and from the hand [m]."""
+FREE_AHEAD, FREE_BEHIND, FREE_ARM = 0.06, 0.05, 0.05
+"""Distance of others from where a pushed object goes, from the hand behind it, and from
+the arm between shoulder and hand, which is low then [m]."""
 BETWEEN_HANDS = 0.06
 """By how much the left hand's object must be further left than the other's [m]."""
 
@@ -154,22 +155,24 @@ class Free:
         """Return whether a hand can get behind an object, and push it all the way."""
         ahead = np.array(DIRECTIONS[direction][:2])
         place = np.array(things[index][2:])
-        others = np.array([t[2:] for i, t in enumerate(things) if i != index])
-        if len(others):
-            along = ((others - place) @ ahead).clip(0, Push.distance)
-            line = place + along[:, None] * ahead  # the nearest of it to each
-            free = np.linalg.norm(others - line, axis=1) > FREE_AHEAD
-            room = np.linalg.norm(others - place + BEHIND * ahead, axis=1) > FREE_BEHIND
-            if not (free & room).all():
-                return False
-        return any(
-            self._pushes(shoulder, place, ahead) for shoulder in self.hands.values()
+        beside = [t[2:] for i, t in enumerate(things) if i != index]
+        others = np.array(beside).reshape(-1, 2)
+        end, behind = place + Push.distance * ahead, place - BEHIND * ahead
+        free = _away(others, place, end) > FREE_AHEAD
+        free &= _away(others, behind, behind) > FREE_BEHIND
+        return bool(free.all()) and any(
+            self._pushes(shoulder, place, ahead, others)
+            for shoulder in self.hands.values()
         )
 
     def _pushes(
-        self, shoulder: np.ndarray, place: np.ndarray, ahead: np.ndarray
+        self,
+        shoulder: np.ndarray,
+        place: np.ndarray,
+        ahead: np.ndarray,
+        others: np.ndarray,
     ) -> bool:
-        """Return whether the arm of a shoulder reaches all along a push."""
+        """Return whether a shoulder's arm reaches all along a push, over nothing."""
         side = np.sign(shoulder[1])
         ways = {1.0: "outward", -1.0: "inward", 0.0: "away"}
         least, most = PUSHES[ways[float(side * ahead[1])]]
@@ -177,7 +180,9 @@ class Free:
             return False
         ends = place + np.array([[-BEHIND], [AT_END]]) * ahead
         away = np.linalg.norm(ends - shoulder, axis=1)
-        return bool(((INNER * self.reach <= away) & (away <= self.reach)).all())
+        if not ((INNER * self.reach <= away) & (away <= self.reach)).all():
+            return False
+        return all((_away(others, shoulder, end) > FREE_ARM).all() for end in ends)
 
     def _can_both(
         self, acts: Sequence[tuple[str, int]], things: Sequence[Thing]
@@ -191,6 +196,13 @@ class Free:
         if "touch" not in verbs:
             return verbs == ("left hand", "right hand")
         return all(map(self._touches, ("left", "right"), places))
+
+
+def _away(places: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return how far places [n, 2] are from the segment from a to b [n] [m]."""
+    way = b - a
+    share = ((places - a) @ way / max(way @ way, 1e-12)).clip(0, 1)
+    return np.linalg.norm(places - a - share[:, None] * way, axis=1)
 
 
 def layout_of(experiment: Experiment, robot: Robot | type[Robot]) -> Seats | Free:

@@ -233,7 +233,8 @@ class SAC(Algorithm):
                 self._improve_agent(now)
         if self.updates % LOGGED:
             return {}
-        figures = {k: float(torch.stack(v).mean()) for k, v in self._history.items()}
+        history = sorted(self._history.items())  # a table's columns keep their order
+        figures = {k: float(torch.stack(v).mean()) for k, v in history}
         self._history.clear()
         check_finite(
             {k: torch.tensor(v) for k, v in figures.items()},
