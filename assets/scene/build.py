@@ -26,13 +26,13 @@ SKIRTING_HEIGHT = 0.05
 """Height of the skirting board [m]."""
 BUTTON_PROFILE = ((-0.012, 0.020), (0.006, 0.020), (0.011, 0.016), (0.012, 0.0))
 """(height, radius) of the button from the foot up, about its center [m]."""
-CAN_PROFILE = ((-0.0275, 0.0), (-0.0275, 0.020), (0.0275, 0.020))
+CAN_PROFILE = ((-0.0210, 0.0), (-0.0210, 0.020), (0.0210, 0.020))
 """(height, radius) of the can's side, about its center [m]."""
-LID_PROFILE = ((0.0280, 0.019), (0.0280, 0.0))
+LID_PROFILE = ((0.0215, 0.019), (0.0215, 0.0))
 """The same of its lid, just above."""
 SEGMENTS = 12
 """Points per ring of what is round."""
-PYRAMID_EDGE, PYRAMID_HEIGHT = 0.044, 0.050
+PYRAMID_EDGE, PYRAMID_HEIGHT = 0.044, 0.044
 """[m]"""
 TIP = 0.4
 """Share of the pyramid's height that is its tip."""

@@ -33,7 +33,7 @@ TABLE_TOP = 0.03
 """Height of the table top [m]."""
 TABLE_THICKNESS = 0.02
 """Thickness of the table top [m]."""
-OBJECT_HEIGHT = {"cube": OBJECT_SIZE, "button": 0.024, "can": 0.055, "pyramid": 0.05}
+OBJECT_HEIGHT = {"cube": OBJECT_SIZE, "button": 0.024, "can": 0.042, "pyramid": 0.044}
 """Height of each shape [m]."""
 DENSITY = 0.05 / OBJECT_SIZE**3
 """Of what is free: a cube has 50 g at NAO's scale [kg/m^3]."""
