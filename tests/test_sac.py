@@ -90,6 +90,7 @@ def test_it_learns_to_touch_what_the_sentence_names(tmp_path) -> None:
 
 def test_steps_are_drawn_with_the_sentence_that_they_are_judged_under(tmp_path) -> None:
     algorithm = collected(tmp_path, ToyVectorEnv(snapshots=True))
+    algorithm.config = dataclasses.replace(algorithm.config, batch=600)
     drawn = algorithm._draw()
     goal = torch.where(drawn["instruction"][:, 1] == 4, -0.6, 0.6)  # token 4: "left"
     off = (drawn["next.proprioception"][:, 0, 0] - goal).abs()
