@@ -92,7 +92,7 @@ class SACConfig:
     any of its sentences."""
     batch: int = 256
     """Steps of each gradient, rounded up to whole episodes' share."""
-    each: int = 2
+    each: int = 1
     """Steps of a gradient that are of one episode, under one sentence: as reading takes
     as long as seeing, they share it."""
     gradients: int = 2
@@ -101,18 +101,18 @@ class SACConfig:
     """Gradients of the critics for one of the actor."""
     learning_rate: float = 3e-4
     """Adam's step size."""
-    encoder_rate: float = 1e-3
+    encoder_rate: float = 3e-4
     """The same for what reads, sees and feels, which has the auxiliary losses too."""
     gamma: float = 0.95
     """Discount of a step."""
     reward_scale: float = 0.2
     """Factor of rewards, beside which entropy counts."""
-    facts_weight: float = 0.1
+    facts_weight: float = 0.0
     """Weight of the loss that asks the Language System what the goal is; 0: none."""
-    reading_steps: int = 300
+    reading_steps: int = 0
     """Gradients of that loss alone, before any other: who cannot read learns little
     from pictures."""
-    looking_steps: int = 300
+    looking_steps: int = 0
     """Gradients of the auxiliary losses alone, after these."""
     polyak: float = 0.005
     """How far the slow critics follow at each gradient."""
@@ -259,7 +259,7 @@ CONFIGS: dict[str, TrainConfig] = {
             actor="squashed",
             critic="none",
             language_length=40,
-            auxiliary_weight=10.0,
+            auxiliary_weight=2.0,
         ),
     ),
     "vision": TrainConfig(
