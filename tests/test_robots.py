@@ -78,8 +78,13 @@ def test_nothing_vibrates_while_the_start_is_held(env: TouchEnv) -> None:
 
 
 @pytest.mark.slow
-def test_two_thousand_random_actions_break_no_limit(env: TouchEnv) -> None:
+@pytest.mark.parametrize("task", [TASK, "NaoInstruct-v1"])
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_two_thousand_random_actions_break_no_limit(robot: str, task: str) -> None:
+    env = gym.make(task, robot_uids=robot, control_mode=DELTA, **FAST).unwrapped
     env.reset(seed=0)
+    exact = 15 if task == TASK else env.agent.solver_iterations
+    assert env.agent.robot._objs[0].solver_position_iterations == exact
     low, high = env.agent.robot.get_qlimits()[0].T  # [J]
     slides = [env.agent._motors[j.name].slides for j in env.agent.robot.active_joints]
     slack = torch.where(torch.tensor(slides), 0.002, math.radians(2))  # 2 mm, 2 degrees
@@ -91,6 +96,7 @@ def test_two_thousand_random_actions_break_no_limit(env: TouchEnv) -> None:
         qpos = env.agent.robot.get_qpos()[0]
         assert qpos.isfinite().all()
         assert ((qpos >= low - slack) & (qpos <= high + slack)).all()
+    env.close()
 
 
 def test_hands_start_above_the_table_near_the_objects_and_free(env: TouchEnv) -> None:

@@ -21,8 +21,8 @@ from trees import leaves
 
 import ir_maniskill
 from ir_maniskill import experiment as catalog
-from ir_maniskill.environment.robots.nao import JOINTS
-from ir_maniskill.environment.touch_env import TouchEnv
+from ir_maniskill.environment.robots.nao import JOINTS, Nao
+from ir_maniskill.environment.touch_env import CONTACT_OFFSET, TouchEnv
 from ir_maniskill.experiment import Jitter
 from ir_maniskill.goals import Ref, Touch
 
@@ -420,6 +420,30 @@ def test_a_touch_between_two_steps_counts(fixed: gym.Env) -> None:
     base._touch.update = update
     assert seen == [True] * 5
     assert info["success"].item()
+
+
+def test_a_pressed_cube_stays_pressed_in_the_physics_of_spoken_tasks(
+    fixed: gym.Env,
+) -> None:
+    physics = {"solver_position_iterations": Nao.solver_iterations}
+    physics["contact_offset"] = CONTACT_OFFSET
+    env = gym.make(
+        fixed.spec.id,
+        obs_mode="state_dict",
+        render_backend="none",
+        sim_config={"scene_config": physics},
+    )
+    env.reset(seed=0, options={"instruction": RED})
+    hold(env, **PRESS)
+    base = env.unwrapped
+    start, before = base.table.poses(), base.agent.robot.get_qpos().clone()
+    for _ in range(40):  # 2 s
+        *_, info = hold(env, 1, **PRESS)
+        assert info["success"].item()
+        assert (base.agent.robot.get_qpos() - before).abs().max() < 0.002  # [rad]
+    moved = base.table.poses() - start
+    assert moved[..., :3].norm(dim=-1).max() < 0.002  # [m]
+    env.close()
 
 
 def test_dense_reward_grows_as_the_hand_comes_near() -> None:

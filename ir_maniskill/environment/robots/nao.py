@@ -114,6 +114,7 @@ class Nao(Robot):
     postures = POSTURES
     shoulders = SHOULDERS
     reach = REACH
+    solver_iterations = 4
 
     def drive(self, joint: str) -> JointGroup:
         """Return how a joint is driven: as one of the hand or of the arm."""

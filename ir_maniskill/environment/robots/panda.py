@@ -69,6 +69,7 @@ class Panda(Robot):
     postures = POSTURES
     mount = sapien.Pose([BASE_X, 0, BASE_Z])
     stand = 0.2
+    solver_iterations = 4
     scale = 1.8
     shoulders = ((BASE_X, 0.0),)
     reach = 0.75

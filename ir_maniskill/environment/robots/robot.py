@@ -75,6 +75,9 @@ class Robot(BaseAgent, ABC):
     rebound: float = math.inf
     """Fastest that a link is pushed out of what it got into; a strong arm with light
     fingers explodes without a limit [m/s]."""
+    solver_iterations: int = 15
+    """Position iterations of the solver in a physics step of `Spoken` tasks: what
+    physics costs most. With too few, limits give way and fingers slip off things."""
     scale: float = 1.0
     """How large table, objects, layout and cameras are, beside NAO's."""
     shoulders: tuple[tuple[float, float], ...]

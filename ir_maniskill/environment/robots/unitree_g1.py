@@ -98,6 +98,7 @@ class UnitreeG1(Robot):
     postures = POSTURES
     mount = sapien.Pose([SHOULDER_X, 0, SCALE * SOLE_HEIGHT - SOLE])
     rebound = 1.0
+    solver_iterations = 10
     scale = SCALE
     shoulders = ((SHOULDER_X, SHOULDER_Y), (SHOULDER_X, -SHOULDER_Y))
     reach = 0.48
