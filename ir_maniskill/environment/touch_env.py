@@ -188,7 +188,8 @@ class TouchEnv(RenderedEnv):
 
     def _initialize_episode(self, env_idx: Tensor, options: dict) -> None:
         slots, joints = self.experiment.slots, len(self.agent.start_qpos)
-        sizes = [1, self._layout.noise, slots, joints]
+        laid = self._layout.noise if self._speaker is None else 0  # it draws its own
+        sizes = [1, laid, slots, joints]
         noise = self._batched_episode_rng[env_idx].uniform(size=sum(sizes))
         pick, layout, yaw, joint = np.split(noise, np.cumsum(sizes)[:-1], axis=1)
         told = options.get("instruction")
