@@ -7,10 +7,11 @@ from scenes import scene
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.reward_generator import RewardWeights
+from ir_maniskill.environment.senses import text_of
 from ir_maniskill.goals import Avoid, Both, Instruction, Push, Ref, Then, Touch
 from ir_maniskill.snapshot import Snapshot
 from ir_maniskill.training.config import CONFIGS
-from ir_maniskill.training.hindsight import FACTS, Hindsight, facts
+from ir_maniskill.training.hindsight import Hindsight, Pursuit
 
 HANDS = {"left": ("a", "b", "c"), "right": ("d", "e", "f")}
 SHUFFLED = catalog.get("NaoTouchCubeShuffled-v1")
@@ -71,15 +72,6 @@ def test_critics_are_told_of_every_kind_of_goal_in_as_many_numbers() -> None:
     assert len(torch.unique(goal[0], dim=0)) == 4, "two goals look the same"
 
 
-def test_facts_tell_goals_apart_and_not_how_they_are_said() -> None:
-    red, blue = Ref("red"), Ref("blue", "cube")
-    goals = Touch(red), Touch(blue), Touch(red, "left"), Push(red, "left"), Avoid(red)
-    told = [frozenset(facts(goal)) for goal in (*goals, Both(Touch(red), Touch(blue)))]
-    assert len(set(told)) == len(told)
-    assert facts(Touch(Ref("red"))) == facts(Touch(red))
-    assert all(0 <= fact < FACTS for each in told for fact in each)
-
-
 def test_a_listed_task_is_judged_under_its_own_sentences() -> None:
     hindsight = Hindsight(SHUFFLED, HANDS, None, others=8)
     found = hindsight.find(scene(), SHUFFLED.sentences[1])
@@ -103,14 +95,18 @@ def test_an_episode_is_judged_as_the_env_judged_it(task) -> None:
     config = CONFIGS["listen"]
     hindsight = Hindsight.of(type(config)(**{**vars(config), "env_id": task}), others=4)
     assert hindsight.weights.equal(RewardWeights().vector())
-    touched = 0
+    pursuit, touched = Pursuit(hindsight, 1), 0
     for seed in range(3):
         env.reset(seed=seed)
         scenes, rewards, ends = [base.snapshot()], [], []
+        text = text_of(base.get_language_instruction())
+        pursuit.forget([0])
+        looks = [pursuit.look(base.snapshot(), text)]
         for _ in range(32):
             action = 2 * torch.rand(26, generator=generator) - 1
             _, reward, _, _, info = env.step(action)
             scenes.append(base.snapshot())
+            looks.append(pursuit.look(base.snapshot(), text))
             rewards.append(reward)
             ends.append((info["success"], info["wrong_once"]))
             touched += int(info["contact"].any())
@@ -123,5 +119,6 @@ def test_an_episode_is_judged_as_the_env_judged_it(task) -> None:
         holds, wrong = (torch.cat(column) for column in zip(*ends, strict=True))
         assert judged.holds[1:, 0].equal(holds)
         assert judged.fouled[1:, 0].equal(wrong)
+        torch.testing.assert_close(torch.cat(looks), judged.goal[:, 0])
     env.close()
     assert touched > 0, "nothing was judged"

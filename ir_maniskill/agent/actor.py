@@ -104,5 +104,5 @@ class SquashedActor(nn.Module):
 
     def forward(self, aligned: Tensor) -> Squashed:
         """Return the distribution of a_t [N, A], of B_t [N, D]."""
-        center, log_std = self.layers(aligned).chunk(2, dim=-1)
+        center, log_std = self.layers(aligned).float().chunk(2, dim=-1)
         return Squashed(center, log_std.clamp(*self.LOG_STD))

@@ -55,15 +55,19 @@ class Verdict:
 
 def judge(scene: Snapshot, measure: Measure) -> Verdict:
     """Tell right from wrong contacts, and whether something was disturbed."""
-    serves = measure.serves & ~measure.bars  # [N, F, C]
-    asks = measure.serves.flatten(1).any(dim=1)[:, None, None]
-    fouls = measure.bars | (asks & ~measure.serves)
+    serves, fouls = measure.serves & ~measure.bars, forbidden(measure)  # [N, F, C]
     moved = scene.moved.norm(dim=2) > MOVED  # [N, C]
     return Verdict(
         right=(scene.contact & serves).any(dim=2),
         wrong=(scene.contact & fouls).any(dim=2),
         disturbed=(moved & ~measure.may_move).any(dim=1),
     )
+
+
+def forbidden(measure: Measure) -> Tensor:
+    """Return which contacts a goal does not allow [N, F, C] bool."""
+    asks = measure.serves.flatten(1).any(dim=1)[:, None, None]
+    return measure.bars | (asks & ~measure.serves)
 
 
 def sparse_reward(

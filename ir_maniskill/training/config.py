@@ -90,42 +90,39 @@ class SACConfig:
     own: float = 0.1
     """Share of the steps that are learned from under what was said; the rest is under
     any of its sentences."""
-    batch: int = 256
-    """Steps of each gradient, rounded up to whole episodes' share."""
-    each: int = 1
-    """Steps of a gradient that are of one episode, under one sentence: as reading takes
-    as long as seeing, they share it."""
-    gradients: int = 2
-    """Gradients of the critics for each step of all envs."""
-    actor_every: int = 2
-    """Gradients of the critics for one of the actor."""
+    batch: int = 512
+    """Steps of each gradient of critics and teacher."""
+    gradients: int = 4
+    """Gradients of the critics for each step of all envs; the teacher has half of
+    them."""
+    policy_batch: int = 256
+    """States of each gradient of the policy."""
+    imitations: int = 1
+    """Gradients of the policy for each step of all envs."""
+    policy_acts: float = 0.75
+    """Share of the envs in which the policy acts at the end, and none at the start."""
     learning_rate: float = 3e-4
-    """Adam's step size."""
-    encoder_rate: float = 3e-4
-    """The same for what reads, sees and feels, which has the auxiliary losses too."""
+    """Adam's step size of critics and teacher."""
+    policy_rate: float = 5e-4
+    """Adam's step size of the policy."""
     gamma: float = 0.95
     """Discount of a step."""
     reward_scale: float = 0.2
     """Factor of rewards, beside which entropy counts."""
-    facts_weight: float = 0.0
-    """Weight of the loss that asks the Language System what the goal is; 0: none."""
-    reading_steps: int = 0
-    """Gradients of that loss alone, before any other: who cannot read learns little
-    from pictures."""
-    looking_steps: int = 0
-    """Gradients of the auxiliary losses alone, after these."""
     polyak: float = 0.005
     """How far the slow critics follow at each gradient."""
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
         require_types(self)
-        positive = "capacity first_steps batch each gradients actor_every"
+        positive = "capacity first_steps batch gradients policy_batch"
         require_fields(self, positive, lambda x: x > 0, "at least 1")
-        unsigned = "random_steps others facts_weight reading_steps looking_steps"
+        unsigned = "random_steps others imitations"
         require_fields(self, unsigned, lambda x: x >= 0, "0 or more")
-        require_fields(self, "gamma own polyak", lambda x: 0 <= x <= 1, "0 to 1")
-        above = "learning_rate encoder_rate reward_scale"
+        require_fields(
+            self, "gamma own policy_acts polyak", lambda x: 0 <= x <= 1, "0 to 1"
+        )
+        above = "learning_rate policy_rate reward_scale"
         require_fields(self, above, lambda x: 0 < x < math.inf, "more than 0")
 
 

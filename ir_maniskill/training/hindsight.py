@@ -8,12 +8,9 @@ Legend: R = T + 1 rows of an episode of T steps, M sentences, F fingers, C objec
 
 from __future__ import annotations
 
-import dataclasses
-import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from random import Random
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,7 +21,7 @@ from ir_maniskill.environment.instructional_set import GoalBatch, GoalTable
 from ir_maniskill.environment.layout import layout_of
 from ir_maniskill.environment.reward_generator import Verdict
 from ir_maniskill.environment.robots.robot import available_robots, find_robot
-from ir_maniskill.environment.senses import text_of, tokens_of
+from ir_maniskill.environment.senses import read_text, text_of, tokens_of
 from ir_maniskill.environment.speaker import Speaker
 from ir_maniskill.experiment import Experiment, Spoken
 from ir_maniskill.goals import SHAPES, Goal, Instruction, Measure
@@ -72,7 +69,7 @@ class Hindsight:
         self.experiment, self.weights, self.speaker = experiment, weights, speaker
         fingers = [finger for hand in hands.values() for finger in hand]
         self.fingers = len(fingers)
-        self._hands = {
+        self.hands = {
             name: torch.tensor([finger in own for finger in fingers])
             for name, own in hands.items()
         }
@@ -100,8 +97,7 @@ class Hindsight:
 
     def find(self, start: Snapshot, said: str) -> list[Instruction]:
         """Return M instructions that are true of a scene [1], what was said first."""
-        known = {instruction.text: instruction for instruction in self._listed}
-        own = known.get(said) or Instruction(said, parse(said))
+        own = self.said(said)
         count = self.sentences - 1
         if self.speaker is None:
             others = [each for each in self._listed if each != own]
@@ -112,19 +108,16 @@ class Hindsight:
         drawn = (self.speaker.say(scene, rng) for _ in range(count))
         return [own, *(each or own for each in drawn)]
 
+    def said(self, text: str) -> Instruction:
+        """Return the instruction of a sentence."""
+        known = {instruction.text: instruction for instruction in self._listed}
+        return known.get(text) or Instruction(text, parse(text))
+
     def read(
         self, instructions: Sequence[Instruction], entries: Mapping[str, int]
     ) -> dict[str, Tensor]:
-        """Return the sentences as a state has them [M, ...], in entries so long.
-
-        Beside them are the `facts` of what they ask for, padded with `FACTS`.
-        """
-        texts = [instruction.text for instruction in instructions]
-        asked = [
-            sorted(facts(instruction.goal))[:MOST_FACTS] for instruction in instructions
-        ]
-        padded = [row + [FACTS] * (MOST_FACTS - len(row)) for row in asked]
-        read = {"facts": torch.tensor(padded, dtype=torch.int16)}
+        """Return the sentences as a state has them [M, ...], in entries so long."""
+        texts, read = [instruction.text for instruction in instructions], {}
         if "instruction" in entries:
             words, length = self.experiment.vocabulary, entries["instruction"]
             read["instruction"] = tokens_of(texts, words, length).to(torch.int16)
@@ -137,7 +130,7 @@ class Hindsight:
     def judge(self, episode: Snapshot, instructions: Sequence[Instruction]) -> Judged:
         """Judge an episode [R], whose goals are resolved where it began."""
         rows, count = len(episode.contact), len(instructions)
-        table = GoalTable([i.goal for i in instructions], self._hands, _CPU)
+        table = GoalTable([i.goal for i in instructions], self.hands, _CPU)
         start = episode.rows(torch.zeros(count, dtype=torch.int64))
         goals = table.deal(torch.arange(count), start)
         goals = goals.rows(torch.arange(count).repeat(rows))
@@ -204,28 +197,40 @@ def _middle(values: Tensor, measure: Measure) -> Tensor:
     return (values * named).sum(dim=1) / named.sum(dim=1).clamp(min=1)
 
 
-# -- What sentences ask for ------------------------------------------------------------
+class Pursuit:
+    """The goals that N envs pursue, told at each step as `Hindsight.judge` tells them."""
 
-FACTS, MOST_FACTS = 512, 32
-"""Numbers that facts have, and how many of a goal's are kept."""
+    def __init__(self, hindsight: Hindsight, envs: int) -> None:
+        """Begin with no goals."""
+        self.hindsight, self.envs = hindsight, envs
+        self._asked: list[Goal | None] = [None] * envs
+        self._goals = GoalBatch(())
+        self._fouled = torch.zeros(envs, dtype=torch.bool)
 
+    def forget(self, envs: Iterable[int]) -> None:
+        """Learn that new episodes begin in some envs."""
+        for env in envs:
+            self._asked[env] = None
 
-def facts(goal: Goal) -> set[int]:
-    """Return what a goal says as numbers below `FACTS`, one for each field's value.
+    def look(self, scene: Snapshot, text: Tensor) -> Tensor:
+        """Return what is told of the goals [N, D]; once a step, in its order.
 
-    Numbers are hashes, so this does for any kind of goal; that two facts share one is
-    rare, and does little harm.
-    """
-    return {zlib.crc32(fact.encode()) % FACTS for fact in _told(goal, "goal")}
-
-
-def _told(value: Any, path: str) -> Iterator[str]:
-    if not dataclasses.is_dataclass(value):
-        yield f"{path} {value}"
-        return
-    yield f"{path} {type(value).__name__}"
-    for field in dataclasses.fields(value):
-        yield from _told(getattr(value, field.name), f"{path}.{field.name}")
+        Args:
+            scene: The envs now.
+            text: What each was told [N, B].
+        """
+        new = torch.tensor([goal is None for goal in self._asked])
+        if new.any():
+            texts = zip(self._asked, read_text(text), strict=True)
+            self._asked = [
+                goal or self.hindsight.said(said).goal for goal, said in texts
+            ]
+            table = GoalTable(self._asked, self.hindsight.hands, _CPU)
+            self._goals = table.deal(torch.arange(self.envs), scene)
+        measure = self._goals.measure(scene)
+        verdict = reward_generator.judge(scene, measure)
+        self._fouled = (self._fouled | verdict.foul) & ~new
+        return describe(scene, measure, verdict, self._fouled)
 
 
 # -- What critics read -----------------------------------------------------------------
@@ -245,11 +250,13 @@ def describe(
     aim = (scene.position[:, None] + measure.aim[:, None]).where(serves[..., None], 0)
     each = aim.sum(dim=2) / serves.sum(dim=2, keepdim=True).clamp(min=1)  # [N, F, 3]
     way = (each - scene.fingertip) * serves.any(dim=2, keepdim=True)
+    there = (scene.color >= 0)[:, None]  # [N, 1, C]
+    threat = _nearest(scene, reward_generator.forbidden(measure) & there)
     flags = (
         *(serves, measure.bars.any(dim=1), measure.may_move, measure.still),
         *(verdict.right, verdict.wrong, verdict.disturbed, measure.holds, fouled),
     )
-    lengths = (way, _middle(scene.position, measure), 2 * _middle(scene.moved, measure))
+    lengths = (way, threat, _middle(scene.position, measure), 2 * _middle(scene.moved, measure))
     numbers = (measure.level, measure.gap / LENGTH, measure.stage)
     columns = [
         *(flag.flatten(1) if flag.ndim > 1 else flag[:, None] for flag in flags),
@@ -257,6 +264,16 @@ def describe(
         *(number[:, None] for number in numbers),
     ]
     return torch.cat([column.float() for column in columns], dim=1).clamp(-10, 10)
+
+
+def _nearest(scene: Snapshot, which: Tensor) -> Tensor:
+    """Return the way from each finger to the nearest of some objects [N, F, C] bool.
+
+    It is 0 where there is none: [N, F, 3] [m].
+    """
+    near = scene.distance.where(which, torch.inf).argmin(dim=2)[..., None, None]
+    to_finger = scene.to_object.gather(2, near.expand(-1, -1, -1, 3)).squeeze(2)
+    return -to_finger * which.any(dim=2, keepdim=True)
 
 
 def simulated(scene: Snapshot) -> Tensor:

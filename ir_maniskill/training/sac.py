@@ -1,7 +1,8 @@
 """Soft actor-critic (Haarnoja et al., 2018) with hindsight under other sentences.
 
-The critics read the simulator's state and the goal, in training only; the actor sees
-what it will see later, and reads the sentence.
+A teacher, which reads the simulator's state and the goal, learns from reward; a policy,
+which reads the sentence and perceives what it will later, imitates it meanwhile (DAgger,
+Ross et al., 2011).
 
 Legend: N envs, B steps of a batch, A numbers of an action, D numbers a critic reads.
 """
@@ -20,6 +21,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ir_maniskill.agent.actor import Squashed, SquashedActor
 from ir_maniskill.agent.agent import Agent, StateSpec
 from ir_maniskill.agent.cell_vision import CellVision
 from ir_maniskill.checks import require
@@ -36,19 +38,25 @@ from ir_maniskill.training.algorithm import (
 )
 from ir_maniskill.training.config import SACConfig, TrainConfig
 from ir_maniskill.training.finite import check_finite
-from ir_maniskill.training.hindsight import FACTS, LENGTH, Hindsight, simulated
+from ir_maniskill.training.hindsight import LENGTH, Hindsight, Pursuit, simulated
 from ir_maniskill.training.replay import Replay
 
 log = logging.getLogger(__name__)
 
-TEMPERATURE = 0.1
+TEMPERATURE = 0.03
 """Weight of the entropy at the start."""
-READING_RATE, RARE = 3e-3, -5.0
-"""Adam's step size while only reading is learned; logit of a fact at the start."""
+TEMPERATURE_RATE = 1e-3
+"""Adam's step size of its logarithm."""
 LOGGED = 64
 """Updates from one row of the log to the next."""
 WIDTHS = (384, 384)
 """Units of each critic's layers."""
+
+
+def in_16_bits() -> torch.autocast:
+    """Return a context that multiplies in 16 bits, if the processor does so at speed."""
+    fast = torch.cpu._is_avx512_bf16_supported()
+    return torch.autocast("cpu", torch.bfloat16, enabled=fast)
 
 
 class Critics(nn.Module):
@@ -73,15 +81,25 @@ class Critics(nn.Module):
         """Return both values [2, B] of what is known [B, D] and done [B, A]."""
         x = torch.cat([known, action], dim=1).expand(2, -1, -1)
         *hidden, last = zip(self.weights, self.biases, strict=True)
-        for weight, bias in hidden:
-            x = torch.baddbmm(bias, x, weight)
-            x = functional.relu(functional.layer_norm(x, x.shape[-1:]))
+        with in_16_bits():
+            for weight, bias in hidden:
+                x = torch.baddbmm(bias, x, weight)
+                x = functional.relu(functional.layer_norm(x, x.shape[-1:]))
         weight, bias = last
-        return torch.baddbmm(bias, x, weight).squeeze(-1)
+        return torch.baddbmm(bias, x.float(), weight).squeeze(-1)
+
+
+def adam(weights: Iterable[Tensor], rate: float) -> torch.optim.Adam:
+    """Return an optimizer."""
+    return torch.optim.Adam(list(weights), rate, fused=True)
 
 
 class SAC(Algorithm):
-    """Keeps all episodes, and learns from their steps under many sentences."""
+    """A teacher learns from reward, a policy learns to do the same from what it sees.
+
+    Teacher and critics read the simulator's state and the goal. Both learn from all
+    episodes, under many sentences.
+    """
 
     learns_while_stepping = True
 
@@ -109,36 +127,25 @@ class SAC(Algorithm):
         self._use_16_bits()
         read = self.agent.encoder.language.reads
         self._sentence = {name: state[name].shape[1] for name in read}
-        inputs = self._known(self._sizes(state)).shape[1]
+        self.pursuit = Pursuit(self.hindsight, len(state["instruction"]))
+        inputs = self._known(self._simulated(state)).shape[1]
+        self.teacher = SquashedActor(inputs, WIDTHS, actions)
         self.critics = Critics(inputs + actions)
         self.slow = copy.deepcopy(self.critics).requires_grad_(False)
         self.log_temperature = torch.tensor(math.log(TEMPERATURE), requires_grad=True)
-        self.asked = nn.Linear(self.agent.encoder.reading_width, FACTS)
-        """Tells from G_t what the goal is; most facts are not true at first."""
-        nn.init.constant_(self.asked.bias, RARE)
+        rate = self.config.learning_rate
         self._optimizers = {
-            "agent": self._adam_of_agent(),
-            "critics": self._adam(self.critics.parameters()),
-            "temperature": self._adam([self.log_temperature]),
+            "agent": adam(self.agent.parameters(), self.config.policy_rate),
+            "teacher": adam(self.teacher.parameters(), rate),
+            "critics": adam(self.critics.parameters(), rate),
+            "temperature": adam([self.log_temperature], TEMPERATURE_RATE),
         }
         self.replay = Replay(config.sac.capacity)
         self.actions, self.updates = actions, 0
         self._history: dict[str, list[Tensor]] = defaultdict(list)
         self._past: list[State] = []
         """Steps of all envs whose episodes go on, the oldest first."""
-        self._began = torch.zeros(len(state["instruction"]), dtype=torch.int64)
-        """Of each env, which of them its episode began with."""
-
-    def _adam(self, weights: Iterable[Tensor]) -> torch.optim.Adam:
-        return torch.optim.Adam(list(weights), self.config.learning_rate, fused=True)
-
-    def _adam_of_agent(self) -> torch.optim.Adam:
-        encoder = [*self.agent.encoder.parameters(), *self.asked.parameters()]
-        others = [self.agent.actor, self.agent.locator]
-        weights = [w for part in others if part is not None for w in part.parameters()]
-        groups = [{"params": encoder, "lr": self.config.encoder_rate}]
-        groups += [{"params": weights, "lr": self.config.learning_rate}]
-        return torch.optim.Adam(groups, fused=True)
+        self.restart()
 
     def _use_16_bits(self) -> None:
         """Compute pictures' maps in 16 bits where the processor does so at speed."""
@@ -154,14 +161,36 @@ class SAC(Algorithm):
 
     @torch.no_grad()
     def act(self, state: State) -> Tensor:
-        """Sample actions [N, A], and remember what was done in which state."""
+        """Return actions [N, A], and remember what was done in which state.
+
+        In some of the envs the policy acts, so that the teacher shows what to do where
+        the policy gets to; these are the more, the longer the training has lasted.
+        """
         count = len(state["instruction"])
+        known = self._known(self._simulated(state))  # also while it is not needed
         if self.replay.written < self.config.random_steps:
             action = torch.rand(count, self.actions) * 2 - 1
         else:
-            action, _ = self.agent.actor(self.agent.encoder(state)).rsample()
+            action, _ = self._taught(known).rsample()
+            by_policy = round(self.config.policy_acts * self.share * count)
+            if by_policy:
+                some = {name: value[:by_policy] for name, value in state.items()}
+                action[:by_policy] = self.agent.policy(some)
         self._past.append({**self._kept(state), "action": action})
         return action
+
+    def _taught(self, known: Tensor) -> Squashed:
+        """Return what the teacher would do [N, A]."""
+        with in_16_bits():
+            return self.teacher(known)
+
+    def _simulated(self, state: State) -> State:
+        """Return what critics read of a state, before it is put together."""
+        scene = Snapshot.unpack(state["snapshot"], self.hindsight.fingers)
+        goal = self.pursuit.look(scene, state["text"])
+        now = {f"now.{k}": state[k][:, 0] for k in ("proprioception", "target")}
+        kept = {name: state[name] for name in ("joint_velocity", "snapshot")}
+        return now | kept | {"goal": goal}
 
     def _kept(self, state: State) -> State:
         """Return what of a state is kept: of stacks the newest alone."""
@@ -188,6 +217,7 @@ class SAC(Algorithm):
             terminal = torch.zeros(len(rows) + 1, dtype=torch.bool)
             terminal[-1] = outcome.terminated[env]
             self._keep({**episode, "terminal": terminal})
+        self.pursuit.forget(ended)
         self._began[ended] = len(self._past)
         oldest = int(self._began.min())
         self._past, self._began = self._past[oldest:], self._began - oldest
@@ -212,7 +242,8 @@ class SAC(Algorithm):
 
     def restart(self) -> None:
         """Forget the episodes that were not seen to end."""
-        self._past, self._began = [], torch.zeros_like(self._began)
+        self._past, self._began = [], torch.zeros(self.pursuit.envs, dtype=torch.int64)
+        self.pursuit.forget(range(self.pursuit.envs))
 
     # -- Learning --------------------------------------------------------------------
 
@@ -220,17 +251,14 @@ class SAC(Algorithm):
         """Make some gradients, once there is enough to learn from."""
         if self.replay.written < self.config.first_steps:
             return {}
-        if not self.updates:
-            self._learn_to_read()
-            for _ in range(self.config.looking_steps):
-                now = self._draw()
-                self._step("agent", self._auxiliary(self.agent.encoder(now), now))
         self.updates += 1
         for turn in range(self.config.gradients):
             now = self._draw()
             self._improve_critics(now)
-            if turn % self.config.actor_every == 0:
-                self._improve_agent(now)
+            if turn % 2 == 0:
+                self._improve_teacher(now)
+        for _ in range(self.config.imitations):
+            self._imitate(self._draw_seen())
         if self.updates % LOGGED:
             return {}
         history = sorted(self._history.items())  # a table's columns keep their order
@@ -247,68 +275,56 @@ class SAC(Algorithm):
 
         What was there after the step is named "next.", as what was before it is named.
         """
-        replay, each = self.replay, self.config.each
-        episodes = -(-self.config.batch // each)
-        rows = replay.draw(episodes, each)
-        which = torch.randint(self.hindsight.sentences, (episodes,))
-        which[torch.rand(episodes) < self.config.own] = 0
-        which = which.repeat(each)  # a sentence is read once, whatever is done under it
-        drawn = self._read(rows, which) | {"action": replay.read("action", rows)}
+        replay = self.replay
+        rows, which = self._rows(self.config.batch)
         after = replay.after(rows)
+        drawn = self._read(rows, which) | {"action": replay.read("action", rows)}
         drawn |= {f"next.{k}": v for k, v in self._read(after, which).items()}
-        drawn["facts"] = replay.read("facts", rows, column=which)
         drawn["reward"] = replay.read("reward", after, column=which)
         drawn["terminal"] = replay.read("terminal", after)
         return drawn
 
-    def _read(self, rows: Tensor, which: Tensor) -> State:
-        replay, frames = self.replay, self.frames
+    def _draw_seen(self) -> State:
+        """Return a batch of states as the policy perceives them, and the truth."""
+        replay = self.replay
+        rows, which = self._rows(self.config.policy_batch)
         sensed = self.agent.encoder.sensed
-        read = {name: replay.read(name, rows, frames=frames) for name in sensed}
-        read |= self._sentences(rows, which)
-        for name in ("proprioception", "target"):
-            read[f"now.{name}"] = replay.read(name, rows)
-        for name in ("joint_velocity", "snapshot"):
-            read[name] = replay.read(name, rows)
-        for name in ("goal", "named"):
-            read[name] = replay.read(name, rows, column=which).float()
-        return read
+        seen = {name: replay.read(name, rows, frames=self.frames) for name in sensed}
+        seen |= {k: replay.read(k, rows, column=which) for k in self._sentence}
+        if "instruction" in seen:
+            seen["instruction"] = seen["instruction"].long()
+        named = replay.read("named", rows, column=which)
+        return seen | self._read(rows, which) | {"named": named}
 
-    def _sentences(self, rows: Tensor, which: Tensor) -> State:
-        read = {k: self.replay.read(k, rows, column=which) for k in self._sentence}
-        if "instruction" in read:
-            read["instruction"] = read["instruction"].long()
-        return read
+    def _rows(self, count: int) -> tuple[Tensor, Tensor]:
+        """Return rows [B], and under which of its sentences to see each [B]."""
+        which = torch.randint(self.hindsight.sentences, (count,))
+        which[torch.rand(count) < self.config.own] = 0
+        return self.replay.draw(count), which
+
+    def _read(self, rows: Tensor, which: Tensor) -> State:
+        """Return what critics read of some rows, before it is put together."""
+        replay = self.replay
+        now = {f"now.{k}": replay.read(k, rows) for k in ("proprioception", "target")}
+        kept = {
+            name: replay.read(name, rows) for name in ("joint_velocity", "snapshot")
+        }
+        return now | kept | {"goal": replay.read("goal", rows, column=which).float()}
 
     def _known(self, read: State) -> Tensor:
-        """Return what critics read [B, D]."""
+        """Return what critics and teacher read [B, D]."""
         scene = simulated(Snapshot.unpack(read["snapshot"], self.hindsight.fingers))
         speed = (read["joint_velocity"] / 10).clamp(-1, 1)
         felt = read["now.proprioception"], read["now.target"]
         return torch.cat([*felt, speed, scene, read["goal"]], dim=1)
 
-    def _sizes(self, state: State) -> State:
-        """Return what `_read` would, of a state whose goal means nothing."""
-        snapshot = state["snapshot"][:1]
-        scene = Snapshot.unpack(snapshot, self.hindsight.fingers)
-        text = read_text(state["text"][:1])[0]
-        judged = self.hindsight.judge(scene, self.hindsight.find(scene, text)[:1])
-        joints = {f"now.{k}": state[k][:1, 0] for k in ("proprioception", "target")}
-        velocity = state["joint_velocity"][:1]
-        return {
-            **joints,
-            "joint_velocity": velocity,
-            "snapshot": snapshot,
-            "goal": judged.goal[:, 0],
-        }
-
     def _improve_critics(self, now: State) -> None:
         """Bring Q to r + gamma (Q' - temperature log pi), Q' being what follows."""
         temperature = self.log_temperature.detach().exp()
-        after = under("next", now)
         with torch.no_grad():
-            action, log_prob = self.agent.actor(self.agent.encoder(after)).rsample()
-            future = self.slow(self._known(after), action).amin(dim=0)
+            after = self._known(under("next", now))
+            action, log_prob = self._taught(after).rsample()
+            future = self.slow(after, action).amin(dim=0)
             future = (future - temperature * log_prob) * ~now["terminal"]
             scale, gamma = self.config.reward_scale, self.config.gamma
             target = scale * now["reward"] + gamma * future
@@ -322,55 +338,30 @@ class SAC(Algorithm):
             torch._foreach_lerp_(list(slow), list(fast), rate)
         self._note(critics=loss, value=value.mean(), reward=now["reward"].mean())
 
-    def _improve_agent(self, now: State) -> None:
+    def _improve_teacher(self, now: State) -> None:
         """Do what both critics value, as randomly as the target entropy asks."""
-        temperature = self.log_temperature.detach().exp()
-        aligned = self.agent.encoder(now)
-        action, log_prob = self.agent.actor(aligned).rsample()
-        value = self.critics(self._known(now), action).amin(dim=0)
-        loss = (temperature * log_prob - value).mean()
-        loss = loss + self._auxiliary(aligned, now)
-        self._step("agent", loss)
-        excess = 0.5 * self.actions - log_prob.detach().mean()  # entropy over -A/2
+        temperature, known = self.log_temperature.detach().exp(), self._known(now)
+        action, log_prob = self._taught(known).rsample()
+        value = self.critics(known, action).amin(dim=0)
+        self._step("teacher", (temperature * log_prob - value).mean())
+        import os
+        excess = -float(os.environ.get('TE','-0.5')) * self.actions - log_prob.detach().mean()  # entropy over -A/2
         self._step("temperature", self.log_temperature.exp() * excess)
         self._note(entropy=-log_prob.mean(), temperature=temperature)
 
-    def _auxiliary(self, aligned: Tensor, now: State) -> Tensor:
-        """Return the weighted losses of what B_t should tell: facts, and a place."""
-        loss = torch.zeros(())
+    def _imitate(self, now: State) -> None:
+        """Do what the teacher does, and tell where the named object is."""
+        with torch.no_grad():
+            shown = self._taught(self._known(now)).mean
+        aligned = self.agent.encoder(now)
+        loss = functional.mse_loss(self.agent.actor(aligned).mean, shown)
+        self._note(imitation=loss)
         if self.agent.locator is not None:
             guess, truth = self.agent.locator(aligned), now["named"]
             off = 2 * functional.huber_loss(guess / LENGTH, truth / LENGTH)
             loss = loss + self.agent.config.auxiliary_weight * off
-            self._note(auxiliary=off)
-        if self.config.facts_weight > 0:
-            said = aligned[:, : self.agent.encoder.reading_width]
-            unread = self._unread(said, now["facts"])
-            loss = loss + self.config.facts_weight * unread
-            self._note(unread=unread)
-        return loss
-
-    def _learn_to_read(self) -> None:
-        """Learn to tell from the sentences alone what the goals are."""
-        encoder = self.agent.encoder
-        parts = (encoder.language, encoder.reading, self.asked)
-        weights = [w for part in parts if part is not None for w in part.parameters()]
-        optimizer = torch.optim.Adam(weights, READING_RATE, fused=True)
-        for _ in range(self.config.reading_steps):
-            rows = self.replay.draw(self.config.batch)
-            which = torch.randint(self.hindsight.sentences, rows.shape)
-            said = encoder.read(self._sentences(rows, which))
-            optimizer.zero_grad()
-            self._unread(said, self.replay.read("facts", rows, column=which)).backward()
-            optimizer.step()
-
-    def _unread(self, said: Tensor, facts: Tensor) -> Tensor:
-        """Return the cross-entropy of the facts [B, n] given G_t [B, D'], summed."""
-        true = torch.zeros(len(facts), FACTS + 1).scatter_(1, facts.long(), 1.0)
-        told = self.asked(said)
-        return functional.binary_cross_entropy_with_logits(
-            told, true[:, :FACTS], reduction="sum"
-        ) / len(facts)
+            self._note(auxiliary=off, off=(guess - truth).norm(dim=1).median())
+        self._step("agent", loss)
 
     def _step(self, name: str, loss: Tensor) -> None:
         """Make one step of an optimizer; the others' weights get no gradient."""
@@ -402,7 +393,7 @@ class SAC(Algorithm):
             "agent": self.agent.state_dict(),
             "critics": self.critics.state_dict(),
             "slow": self.slow.state_dict(),
-            "asked": self.asked.state_dict(),
+            "teacher": self.teacher.state_dict(),
             "replay": self.replay.state_dict(),
         }
 
@@ -411,7 +402,7 @@ class SAC(Algorithm):
         self.agent.load_state_dict(under("agent", tensors))
         self.critics.load_state_dict(under("critics", tensors))
         self.slow.load_state_dict(under("slow", tensors))
-        self.asked.load_state_dict(under("asked", tensors))
+        self.teacher.load_state_dict(under("teacher", tensors))
         self.replay.load_state_dict(under("replay", tensors))
         for name, optimizer in self._optimizers.items():
             load_averages(optimizer, under(f"optimizer.{name}", tensors))
