@@ -1,12 +1,13 @@
 """What an episode would have been worth under other sentences."""
 
+import dataclasses
+
 import gymnasium as gym
 import pytest
 import torch
 from scenes import scene
 
 from ir_maniskill import experiment as catalog
-from ir_maniskill.environment.reward_generator import RewardWeights
 from ir_maniskill.environment.senses import text_of
 from ir_maniskill.goals import Avoid, Both, Instruction, Push, Ref, Then, Touch
 from ir_maniskill.snapshot import Snapshot
@@ -14,6 +15,7 @@ from ir_maniskill.training.config import CONFIGS
 from ir_maniskill.training.hindsight import Hindsight, Pursuit
 
 HANDS = {"left": ("a", "b", "c"), "right": ("d", "e", "f")}
+LISTEN = CONFIGS["listen"]
 SHUFFLED = catalog.get("NaoTouchCubeShuffled-v1")
 
 
@@ -74,12 +76,22 @@ def test_critics_are_told_of_every_kind_of_goal_in_as_many_numbers() -> None:
 
 def test_a_listed_task_is_judged_under_its_own_sentences() -> None:
     hindsight = Hindsight(SHUFFLED, HANDS, None, others=8)
-    found = hindsight.find(scene(), SHUFFLED.sentences[1])
+    found = hindsight.find(scene(), SHUFFLED.sentences[1], 8)
     assert hindsight.sentences == 3
     assert found[0].text == SHUFFLED.sentences[1]
     assert {each.text for each in found} == set(SHUFFLED.sentences)
     read = hindsight.read(found, {"instruction": 7})
     assert read["instruction"].shape == (3, 7)
+
+
+def test_half_of_the_other_sentences_are_those_that_came_true() -> None:
+    hindsight = Hindsight.of(dataclasses.replace(LISTEN, env_id="NaoInstruct-v1"), 4)
+    start = scene()
+    episode = joined(start, scene((0, 1)), scene((0, 1)))  # red is touched
+    for _ in range(5):
+        found, judged = hindsight.choose(episode, "Touch the blue one.")
+        assert found[0].text == "Touch the blue one."
+        assert judged.holds.any(dim=0).sum() >= 2
 
 
 @pytest.mark.parametrize("task", ["NaoTouchCubeShuffled-v1", "NaoInstruct-v1"])
@@ -89,12 +101,11 @@ def test_an_episode_is_judged_as_the_env_judged_it(task) -> None:
         obs_mode="none",
         control_mode="pd_joint_target_delta_pos",
         reward_mode="dense",
+        reward_weights=dataclasses.asdict(LISTEN.reward_weights),
         render_backend="none",
     )
     base, generator = env.unwrapped, torch.Generator().manual_seed(0)
-    config = CONFIGS["listen"]
-    hindsight = Hindsight.of(type(config)(**{**vars(config), "env_id": task}), others=4)
-    assert hindsight.weights.equal(RewardWeights().vector())
+    hindsight = Hindsight.of(dataclasses.replace(LISTEN, env_id=task), others=4)
     pursuit, touched = Pursuit(hindsight, 1), 0
     for seed in range(3):
         env.reset(seed=seed)
@@ -112,9 +123,9 @@ def test_an_episode_is_judged_as_the_env_judged_it(task) -> None:
             touched += int(info["contact"].any())
         rows = Snapshot.unpack(joined(*scenes).pack(), hindsight.fingers)
         (said,) = base.get_language_instruction()
-        found = hindsight.find(rows.rows(torch.zeros(1, dtype=torch.long)), said)
+        found, judged = hindsight.choose(rows, said)
         assert found[0].goal == base.instructions[0].goal
-        judged = hindsight.judge(rows, found)
+        assert len(found) == hindsight.sentences
         torch.testing.assert_close(judged.reward[1:, 0], torch.cat(rewards))
         holds, wrong = (torch.cat(column) for column in zip(*ends, strict=True))
         assert judged.holds[1:, 0].equal(holds)

@@ -57,7 +57,8 @@ def test_both_critics_are_plain_networks_side_by_side() -> None:
             x = x @ critics.weights[layer][index] + critics.biases[layer][index]
             if layer < 2:
                 x = functional.relu(functional.layer_norm(x, x.shape[1:]))
-        torch.testing.assert_close(both[index], x[:, 0])
+        # Products may be in 16 bits.
+        torch.testing.assert_close(both[index], x[:, 0], rtol=0.02, atol=0.01)
 
 
 def test_cells_are_the_pixels_of_squares() -> None:
@@ -90,16 +91,23 @@ def test_it_learns_to_touch_what_the_sentence_names(tmp_path) -> None:
 
 def test_steps_are_drawn_with_the_sentence_that_they_are_judged_under(tmp_path) -> None:
     algorithm = collected(tmp_path, ToyVectorEnv(snapshots=True))
-    algorithm.config = dataclasses.replace(algorithm.config, batch=600)
-    drawn = algorithm._draw()
-    goal = torch.where(drawn["instruction"][:, 1] == 4, -0.6, 0.6)  # token 4: "left"
-    off = (drawn["next.proprioception"][:, 0, 0] - goal).abs()
+    sizes = {"batch": 600, "policy_batch": 600}
+    algorithm.config = dataclasses.replace(algorithm.config, **sizes)
+    drawn, seen = same(algorithm._draw), same(algorithm._draw_seen)
+    goal = torch.where(seen["instruction"][:, 1] == 4, -0.6, 0.6)  # token 4: "left"
+    off = (drawn["next.now.proprioception"][:, 0] - goal).abs()
     near, far = off < 0.2, off > 0.5
     assert near.sum() > 5 and far.sum() > 5
     # Where it holds, a finger each pays 1, or a quarter of it after a foul.
     assert drawn["reward"][near].min() > 1
     assert drawn["reward"][far].max() < 3
-    torch.testing.assert_close(drawn["named"][:, 1], 0.1 * goal)
+    torch.testing.assert_close(seen["named"][:, 1], 0.1 * goal)
+
+
+def same(draw):
+    """Return what is drawn at random, always the same rows."""
+    torch.manual_seed(1)
+    return draw()
 
 
 def collected(tmp_path, envs, episodes=4):
@@ -118,21 +126,32 @@ def collected(tmp_path, envs, episodes=4):
     return algorithm
 
 
-def test_the_language_system_can_be_asked_what_the_goal_is(tmp_path) -> None:
+def test_the_policy_acts_in_ever_more_of_the_envs(tmp_path) -> None:
+    algorithm = collected(tmp_path, envs := ToyVectorEnv(4, snapshots=True))
+    algorithm.agent.policy = lambda state: torch.full((len(state["touch"]), 2), 5.0)
+    state = StateStack(1).reset(envs.reset(seed=0)[0])
+    algorithm.config = dataclasses.replace(algorithm.config, policy_acts=0.5)
+    by_policy = []
+    for share in (0.0, 0.5, 1.0):
+        algorithm.share = share
+        by_policy.append(int((algorithm.act(state) == 5.0).all(dim=1).sum()))
+    assert by_policy == [0, 1, 2]
+
+
+def test_the_policy_learns_to_do_what_the_teacher_does(tmp_path) -> None:
     algorithm = collected(tmp_path, ToyVectorEnv(snapshots=True))
-    algorithm.config = dataclasses.replace(algorithm.config, reading_steps=80)
-    drawn = algorithm._draw()
+    seen = algorithm._draw_seen()
 
-    def unread():
+    def off():
         with torch.no_grad():
-            return algorithm._unread(
-                algorithm.agent.encoder.read(drawn), drawn["facts"]
-            )
+            shown = algorithm._taught(algorithm._known(seen)).mean
+            done = algorithm.agent.actor(algorithm.agent.encoder(seen)).mean
+            return float((shown - done).square().mean())
 
-    before = unread()
-    algorithm._learn_to_read()
-    # Two sentences differ in one fact of two: guessing costs log 2 for each of these.
-    assert unread() < 2 * 0.69 < before
+    before, algorithm.updates = off(), 1000
+    for _ in range(60):
+        algorithm._imitate(algorithm._draw_seen())
+    assert off() < 0.3 * before
 
 
 def test_every_episode_is_kept_whole(tmp_path) -> None:

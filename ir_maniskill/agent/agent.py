@@ -25,7 +25,7 @@ from ir_maniskill.checks import require
 from ir_maniskill.environment.senses import State, askable
 from ir_maniskill.environment.senses import entries as entries_of
 
-READING_WIDTH = 64
+READING_WIDTH = 128
 """Units that G_t is brought to where vision is "cells"."""
 
 

@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from ir_maniskill.agent.alignment import FiLM
 
-CELL, CHANNELS, WIDTH = 4, 32, 128
+CELL, CHANNELS, WIDTH = 4, 32, 256
 """Side of a cell [pixel], maps of each convolution, units of V_t."""
 
 

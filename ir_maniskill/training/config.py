@@ -90,7 +90,7 @@ class SACConfig:
     own: float = 0.1
     """Share of the steps that are learned from under what was said; the rest is under
     any of its sentences."""
-    batch: int = 512
+    batch: int = 256
     """Steps of each gradient of critics and teacher."""
     gradients: int = 4
     """Gradients of the critics for each step of all envs; the teacher has half of
@@ -103,7 +103,7 @@ class SACConfig:
     """Share of the envs in which the policy acts at the end, and none at the start."""
     learning_rate: float = 3e-4
     """Adam's step size of critics and teacher."""
-    policy_rate: float = 5e-4
+    policy_rate: float = 1e-3
     """Adam's step size of the policy."""
     gamma: float = 0.95
     """Discount of a step."""
@@ -251,7 +251,11 @@ CONFIGS: dict[str, TrainConfig] = {
         threads=1,
         frames=1,
         penalty_warmup=0.0,
+        reward_weights=RewardWeights(
+            hold=1.5, approach=3.0, gather=2.0, foul=1.0, speed=2.0
+        ),
         agent=AgentConfig(
+            language="lexicon",
             vision="cells",
             actor="squashed",
             critic="none",

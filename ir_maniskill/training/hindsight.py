@@ -29,6 +29,9 @@ from ir_maniskill.language import parse, things
 from ir_maniskill.snapshot import Snapshot
 from ir_maniskill.training.config import TrainConfig
 
+SOUGHT = 3
+"""How many sentences are judged for each one that is kept."""
+
 
 @dataclass(frozen=True)
 class Judged:
@@ -44,6 +47,10 @@ class Judged:
     """Whether each goal is reached [R, M] bool."""
     fouled: Tensor
     """Whether there was a foul so far [R, M] bool."""
+
+    def columns(self, index: Tensor) -> Judged:
+        """Return it under some of the sentences [m]."""
+        return Judged(*(value[:, index] for value in vars(self).values()))
 
 
 class Hindsight:
@@ -75,10 +82,12 @@ class Hindsight:
         }
         listed = experiment.instructions
         self._listed = () if isinstance(listed, Spoken) else listed
-        self.sentences = 1 + min(
-            others, len(self._listed) - 1 if self._listed else others
-        )
-        """M."""
+        self.others = min(others, len(self._listed) - 1) if self._listed else others
+
+    @property
+    def sentences(self) -> int:
+        """M, under which each episode is kept."""
+        return 1 + self.others
 
     @classmethod
     def of(cls, config: TrainConfig, others: int) -> Hindsight:
@@ -95,18 +104,36 @@ class Hindsight:
 
     # -- Sentences -------------------------------------------------------------------
 
-    def find(self, start: Snapshot, said: str) -> list[Instruction]:
-        """Return M instructions that are true of a scene [1], what was said first."""
+    def find(self, start: Snapshot, said: str, others: int) -> list[Instruction]:
+        """Return instructions that are true of a scene [1]: what was said, and others.
+
+        Of a task that lists its sentences, there are at most as many as it has.
+        """
         own = self.said(said)
-        count = self.sentences - 1
         if self.speaker is None:
-            others = [each for each in self._listed if each != own]
-            order = torch.randperm(len(others))[:count].tolist()
-            return [own, *(others[i] for i in order)]
+            listed = [each for each in self._listed if each != own]
+            order = torch.randperm(len(listed))[:others].tolist()
+            return [own, *(listed[i] for i in order)]
         rng = Random(int(torch.randint(2**31, ())))
         (scene,) = things(start)
-        drawn = (self.speaker.say(scene, rng) for _ in range(count))
+        drawn = (self.speaker.say(scene, rng) for _ in range(others))
         return [own, *(each or own for each in drawn)]
+
+    def choose(self, episode: Snapshot, said: str) -> tuple[list[Instruction], Judged]:
+        """Return the M instructions that most can be learned from, and their judgement.
+
+        Of the others, half are those that the episode happened to fulfil, if there are
+        so many, and half are any.
+        """
+        found = self.find(episode.rows(torch.tensor([0])), said, SOUGHT * self.others)
+        judged = self.judge(episode, found)
+        luck = judged.holds.any(dim=0) + torch.rand(len(found))
+        luck[0] = 3.0  # what was said is among them
+        order = luck.argsort(descending=True)
+        half = 1 + self.others // 2
+        any_other = order[half:][torch.randperm(len(found) - half)]
+        chosen = torch.cat([order[:half], any_other])[: self.sentences]
+        return [found[i] for i in chosen.tolist()], judged.columns(chosen)
 
     def said(self, text: str) -> Instruction:
         """Return the instruction of a sentence."""
@@ -198,7 +225,7 @@ def _middle(values: Tensor, measure: Measure) -> Tensor:
 
 
 class Pursuit:
-    """The goals that N envs pursue, told at each step as `Hindsight.judge` tells them."""
+    """The goals that N envs pursue, told as `Hindsight.judge` tells them."""
 
     def __init__(self, hindsight: Hindsight, envs: int) -> None:
         """Begin with no goals."""
@@ -246,17 +273,19 @@ def describe(
 
     They come from its measure alone, so they serve for any kind of goal.
     """
-    serves = measure.serves  # [N, F, C]
-    aim = (scene.position[:, None] + measure.aim[:, None]).where(serves[..., None], 0)
-    each = aim.sum(dim=2) / serves.sum(dim=2, keepdim=True).clamp(min=1)  # [N, F, 3]
-    way = (each - scene.fingertip) * serves.any(dim=2, keepdim=True)
-    there = (scene.color >= 0)[:, None]  # [N, 1, C]
-    threat = _nearest(scene, reward_generator.forbidden(measure) & there)
+    serves, there = measure.serves, (scene.color >= 0)[:, None]  # [N, F, C]
+    way = _nearest(measure.aim[:, None] - scene.to_object, serves)
+    threat = _nearest(-scene.to_object, reward_generator.forbidden(measure) & there)
     flags = (
         *(serves, measure.bars.any(dim=1), measure.may_move, measure.still),
         *(verdict.right, verdict.wrong, verdict.disturbed, measure.holds, fouled),
     )
-    lengths = (way, threat, _middle(scene.position, measure), 2 * _middle(scene.moved, measure))
+    lengths = (
+        way,
+        threat,
+        _middle(scene.position, measure),
+        2 * _middle(scene.moved, measure),
+    )
     numbers = (measure.level, measure.gap / LENGTH, measure.stage)
     columns = [
         *(flag.flatten(1) if flag.ndim > 1 else flag[:, None] for flag in flags),
@@ -266,14 +295,14 @@ def describe(
     return torch.cat([column.float() for column in columns], dim=1).clamp(-10, 10)
 
 
-def _nearest(scene: Snapshot, which: Tensor) -> Tensor:
-    """Return the way from each finger to the nearest of some objects [N, F, C] bool.
+def _nearest(ways: Tensor, which: Tensor) -> Tensor:
+    """Return the shortest way of each finger [N, F, C, 3] to some objects [N, F, C].
 
     It is 0 where there is none: [N, F, 3] [m].
     """
-    near = scene.distance.where(which, torch.inf).argmin(dim=2)[..., None, None]
-    to_finger = scene.to_object.gather(2, near.expand(-1, -1, -1, 3)).squeeze(2)
-    return -to_finger * which.any(dim=2, keepdim=True)
+    near = ways.norm(dim=3).where(which, torch.inf).argmin(dim=2)[..., None, None]
+    shortest = ways.gather(2, near.expand(-1, -1, 1, 3)).squeeze(2)
+    return shortest * which.any(dim=2, keepdim=True)
 
 
 def simulated(scene: Snapshot) -> Tensor:

@@ -1,8 +1,8 @@
-"""Soft actor-critic (Haarnoja et al., 2018) with hindsight under other sentences.
+"""Soft actor-critic (Haarnoja et al., 2018), hindsight, and a policy that imitates.
 
-A teacher, which reads the simulator's state and the goal, learns from reward; a policy,
-which reads the sentence and perceives what it will later, imitates it meanwhile (DAgger,
-Ross et al., 2011).
+A teacher, which reads the simulator's state and the goal, learns from reward alone. A
+policy, which reads the sentence and perceives what it will later, learns meanwhile to
+do the same, also where it got to by itself (DAgger, Ross et al., 2011).
 
 Legend: N envs, B steps of a batch, A numbers of an action, D numbers a critic reads.
 """
@@ -47,6 +47,12 @@ TEMPERATURE = 0.03
 """Weight of the entropy at the start."""
 TEMPERATURE_RATE = 1e-3
 """Adam's step size of its logarithm."""
+ENTROPY = 0.25
+"""Entropy of each number of an action that the temperature aims at [nat]."""
+WARMUP = 300
+"""Updates in which the policy's step size grows."""
+LONGEST = 10.0
+"""Longest gradient of a step."""
 LOGGED = 64
 """Updates from one row of the log to the next."""
 WIDTHS = (384, 384)
@@ -54,7 +60,7 @@ WIDTHS = (384, 384)
 
 
 def in_16_bits() -> torch.autocast:
-    """Return a context that multiplies in 16 bits, if the processor does so at speed."""
+    """Return a context that multiplies in 16 bits where that is faster."""
     fast = torch.cpu._is_avx512_bf16_supported()
     return torch.autocast("cpu", torch.bfloat16, enabled=fast)
 
@@ -135,7 +141,7 @@ class SAC(Algorithm):
         self.log_temperature = torch.tensor(math.log(TEMPERATURE), requires_grad=True)
         rate = self.config.learning_rate
         self._optimizers = {
-            "agent": adam(self.agent.parameters(), self.config.policy_rate),
+            "agent": adam(self.agent.parameters(), 0.0),  # `_imitate` sets the rate
             "teacher": adam(self.teacher.parameters(), rate),
             "critics": adam(self.critics.parameters(), rate),
             "temperature": adam([self.log_temperature], TEMPERATURE_RATE),
@@ -226,8 +232,7 @@ class SAC(Algorithm):
         """Judge an episode under several sentences, and add it to the replay."""
         scenes = Snapshot.unpack(episode["snapshot"], self.hindsight.fingers)
         (said,) = read_text(episode.pop("text")[:1])
-        found = self.hindsight.find(scenes.rows(torch.tensor([0])), said)
-        judged = self.hindsight.judge(scenes, found)
+        found, judged = self.hindsight.choose(scenes, said)
         sentences = self.hindsight.read(found, self._sentence)
         rows, first = len(scenes.contact), not len(self.replay)
         self.replay.add(
@@ -344,8 +349,7 @@ class SAC(Algorithm):
         action, log_prob = self._taught(known).rsample()
         value = self.critics(known, action).amin(dim=0)
         self._step("teacher", (temperature * log_prob - value).mean())
-        import os
-        excess = -float(os.environ.get('TE','-0.5')) * self.actions - log_prob.detach().mean()  # entropy over -A/2
+        excess = -ENTROPY * self.actions - log_prob.detach().mean()
         self._step("temperature", self.log_temperature.exp() * excess)
         self._note(entropy=-log_prob.mean(), temperature=temperature)
 
@@ -361,7 +365,13 @@ class SAC(Algorithm):
             off = 2 * functional.huber_loss(guess / LENGTH, truth / LENGTH)
             loss = loss + self.agent.config.auxiliary_weight * off
             self._note(auxiliary=off, off=(guess - truth).norm(dim=1).median())
+        self._optimizers["agent"].param_groups[0]["lr"] = self._policy_rate()
         self._step("agent", loss)
+
+    def _policy_rate(self) -> float:
+        """Return Adam's step size: it grows at first, and shrinks in the last third."""
+        grown, left = self.updates / WARMUP, 3 * (1 - self.share)
+        return self.config.policy_rate * min(grown, left + 0.02, 1.0)
 
     def _step(self, name: str, loss: Tensor) -> None:
         """Make one step of an optimizer; the others' weights get no gradient."""
@@ -370,6 +380,7 @@ class SAC(Algorithm):
         gradients = torch.autograd.grad(loss, weights, allow_unused=True)
         for weight, gradient in zip(weights, gradients, strict=True):
             weight.grad = gradient
+        nn.utils.clip_grad_norm_(weights, LONGEST)
         optimizer.step()
 
     def _note(self, **figures: Tensor) -> None:
