@@ -89,13 +89,13 @@ def test_sentences_that_came_true_are_preferred() -> None:
     hindsight = Hindsight.of(dataclasses.replace(LISTEN, env_id="NaoInstruct-v1"), 4)
     episode = joined(scene(), scene((0, 1)), scene((0, 1)))  # red is touched
     chosen = found = 0
-    for _ in range(10):
+    for _ in range(50):
         told, judged = hindsight.choose(episode, "Touch the blue one.")
         assert told[0].text == "Touch the blue one."
         chosen += int(judged.holds.any(dim=0).sum())
         any_of_them = hindsight.find(scene(), "Touch the blue one.", 4)
         found += int(hindsight.judge(episode, any_of_them).holds.any(dim=0).sum())
-    assert found < 18 <= chosen
+    assert chosen > 1.5 * found > 0
 
 
 @pytest.mark.parametrize("task", ["NaoTouchCubeShuffled-v1", "NaoInstruct-v1"])

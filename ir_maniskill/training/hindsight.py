@@ -248,11 +248,10 @@ class Pursuit:
         """
         new = torch.tensor([goal is None for goal in self._asked])
         if new.any():
-            texts = zip(self._asked, read_text(text), strict=True)
-            self._asked = [
-                goal or self.hindsight.said(said).goal for goal, said in texts
-            ]
-            table = GoalTable(self._asked, self.hindsight.hands, _CPU)
+            pairs = zip(self._asked, read_text(text), strict=True)
+            asked = [goal or self.hindsight.said(said).goal for goal, said in pairs]
+            table = GoalTable(asked, self.hindsight.hands, _CPU)
+            self._asked = [*asked]
             self._goals = table.deal(torch.arange(self.envs), scene)
         measure = self._goals.measure(scene)
         verdict = reward_generator.judge(scene, measure)
@@ -280,12 +279,8 @@ def describe(
         *(serves, measure.bars.any(dim=1), measure.may_move, measure.still),
         *(verdict.right, verdict.wrong, verdict.disturbed, measure.holds, fouled),
     )
-    lengths = (
-        way,
-        threat,
-        _middle(scene.position, measure),
-        2 * _middle(scene.moved, measure),
-    )
+    middle, moved = (_middle(x, measure) for x in (scene.position, scene.moved))
+    lengths = (way, threat, middle, 2 * moved)
     numbers = (measure.level, measure.gap / LENGTH, measure.stage)
     columns = [
         *(flag.flatten(1) if flag.ndim > 1 else flag[:, None] for flag in flags),

@@ -151,6 +151,8 @@ class SAC(Algorithm):
         self._history: dict[str, list[Tensor]] = defaultdict(list)
         self._past: list[State] = []
         """Steps of all envs whose episodes go on, the oldest first."""
+        self._began: Tensor
+        """Of each env, which of them its episode began with."""
         self.restart()
 
     def _use_16_bits(self) -> None:
@@ -247,7 +249,8 @@ class SAC(Algorithm):
 
     def restart(self) -> None:
         """Forget the episodes that were not seen to end."""
-        self._past, self._began = [], torch.zeros(self.pursuit.envs, dtype=torch.int64)
+        self._past = []
+        self._began = torch.zeros(self.pursuit.envs, dtype=torch.int64)
         self.pursuit.forget(range(self.pursuit.envs))
 
     # -- Learning --------------------------------------------------------------------
