@@ -8,7 +8,7 @@ from torch.nn import functional
 from toy_envs import HANDS, LENGTH, TASK, ToyVectorEnv, toy_sac
 
 from ir_maniskill.agent.actor import Squashed
-from ir_maniskill.agent.cell_vision import CameraCells, cells
+from ir_maniskill.agent.object_vision import CameraView, cells
 from ir_maniskill.checks import ConfigError
 from ir_maniskill.environment.reward_generator import RewardWeights
 from ir_maniskill.environment.senses import StateStack
@@ -72,11 +72,11 @@ def test_cells_are_the_pixels_of_squares() -> None:
 
 def test_bytes_are_seen_as_numbers_from_minus_one_to_one() -> None:
     torch.manual_seed(0)
-    camera = CameraCells(1, film_width=4)
+    camera = CameraView(1, high=2, wide=2)
     byte = torch.randint(256, (1, 2, 2, 48), dtype=torch.uint8)
     weight, bias = camera.cells.parameters()
     expected = functional.linear(byte * (2 / 255) - 1, weight, bias)
-    torch.testing.assert_close(camera.read(byte, torch.float32), expected)
+    torch.testing.assert_close(camera.read(byte), expected)
 
 
 # -- The algorithm ---------------------------------------------------------------------

@@ -171,7 +171,7 @@ def toy_sac(out, **changes):
     agent = AgentConfig(
         senses=("proprioception", "target"),
         hidden=(32, 32),
-        vision="cells",
+        vision="objects",
         actor="squashed",
         critic="none",
     )

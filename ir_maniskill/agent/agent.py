@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ir_maniskill.agent import cell_vision, language_system
+from ir_maniskill.agent import language_system
 from ir_maniskill.agent.actor import Actor, SquashedActor, tanh_layers
 from ir_maniskill.agent.alignment import Alignment
-from ir_maniskill.agent.cell_vision import CellVision
 from ir_maniskill.agent.config import AgentConfig
 from ir_maniskill.agent.critic import Critic, Standardize
+from ir_maniskill.agent.object_vision import ObjectVision
 from ir_maniskill.agent.perceptual_system import (
     BODY_WIDTH,
     VISION_WIDTH,
@@ -26,7 +26,7 @@ from ir_maniskill.environment.senses import State, askable
 from ir_maniskill.environment.senses import entries as entries_of
 
 READING_WIDTH = 128
-"""Units that G_t is brought to where vision is "cells"."""
+"""Units that G_t is brought to where vision is "objects"."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class StateEncoder(nn.Module):
         self.language = language_system.encoder_of(config)(config)
         self.reading: nn.Module | None = None
         width = self.language.width
-        if config.vision == "cells":
+        if config.vision == "objects":
             norm = nn.LayerNorm(READING_WIDTH), nn.Tanh()
             self.reading = nn.Sequential(nn.Linear(width, READING_WIDTH), *norm)
             width = READING_WIDTH
@@ -123,8 +123,10 @@ class StateEncoder(nn.Module):
             self.body = BodySense(inputs, normalize=config.vision != "paper")
         self.reading_width = self.width = width  # of G_t, and below of B_t
         if self.vision is not None:
-            cell = config.vision == "cells"
-            self.width += cell_vision.WIDTH if cell else VISION_WIDTH
+            objects = config.vision == "objects"
+            self.width += ObjectVision.width if objects else VISION_WIDTH
+        self.seen = slice(self.reading_width, self.width)
+        """Where V_t is in B_t."""
         self.width += BODY_WIDTH if self.felt else 0
         self.alignment = Alignment()
 
@@ -134,7 +136,7 @@ class StateEncoder(nn.Module):
         frames, cameras, height, width, _ = shape
         if config.vision == "paper":
             return PaperVision(frames, cameras)
-        kind = CellVision if config.vision == "cells" else PatchVision
+        kind = ObjectVision if config.vision == "objects" else PatchVision
         return kind(frames, (cameras, height, width), film_width)
 
     def forward(self, state: State) -> Tensor:

@@ -8,7 +8,7 @@ from ir_maniskill.checks import require, require_fields, require_types
 from ir_maniskill.environment.senses import available
 from ir_maniskill.language.tokens import VOCABULARY
 
-Vision = Literal["patches", "paper", "cells"]
+Vision = Literal["patches", "paper", "objects"]
 ActorKind = Literal["gaussian", "squashed"]
 CriticInput = Literal["asymmetric", "separate", "none"]
 
@@ -41,8 +41,8 @@ class AgentConfig:
     vision: Vision = "patches"
     """"paper": two 5x5 convolutions over the cameras side by side; "patches": a
     convolution over 4x4 patches of each camera, then 3x3 ones, all normalized, and
-    so is H_t then; the sentence modulates them (FiLM); "cells": much the same, made for
-    learning from a replay, and G_t is brought to 64 units."""
+    so is H_t then; the sentence modulates them (FiLM); "objects": what lies where, of
+    which the sentence then chooses, and G_t is brought to 128 units."""
     actor: ActorKind = "gaussian"
     """"gaussian": a deviation that a schedule sets; "squashed": one that is read from
     the state, and a tanh that keeps actions within [-1, 1]."""

@@ -97,8 +97,10 @@ class SACConfig:
     them."""
     policy_batch: int = 256
     """States of each gradient of the policy."""
+    policy_from: int = 0
+    """Steps before the policy begins to learn: there is little to imitate yet."""
     imitations: int = 1
-    """Gradients of the policy for each step of all envs."""
+    """Gradients of the policy for each step of all envs, from then on."""
     policy_acts: float = 0.75
     """Share of the envs in which the policy acts at the end, and none at the start."""
     learning_rate: float = 3e-4
@@ -117,7 +119,7 @@ class SACConfig:
         require_types(self)
         positive = "capacity first_steps batch gradients policy_batch"
         require_fields(self, positive, lambda x: x > 0, "at least 1")
-        unsigned = "random_steps others imitations"
+        unsigned = "random_steps others policy_from imitations"
         require_fields(self, unsigned, lambda x: x >= 0, "0 or more")
         require_fields(
             self, "gamma own policy_acts polyak", lambda x: 0 <= x <= 1, "0 to 1"
@@ -256,7 +258,7 @@ CONFIGS: dict[str, TrainConfig] = {
         ),
         agent=AgentConfig(
             language="lexicon",
-            vision="cells",
+            vision="objects",
             actor="squashed",
             critic="none",
             language_length=40,

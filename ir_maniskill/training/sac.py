@@ -23,7 +23,7 @@ from torch.nn import functional
 
 from ir_maniskill.agent.actor import Squashed, SquashedActor
 from ir_maniskill.agent.agent import Agent, StateSpec
-from ir_maniskill.agent.cell_vision import CellVision
+from ir_maniskill.agent.object_vision import ObjectVision
 from ir_maniskill.checks import require
 from ir_maniskill.environment.senses import State, read_text
 from ir_maniskill.snapshot import Snapshot
@@ -130,7 +130,6 @@ class SAC(Algorithm):
         self.frames = config.frames
         self.agent = Agent(config.agent, StateSpec.of(state, actions))
         self.agent.to(state["instruction"].device)
-        self._use_16_bits()
         read = self.agent.encoder.language.reads
         self._sentence = {name: state[name].shape[1] for name in read}
         self.pursuit = Pursuit(self.hindsight, len(state["instruction"]))
@@ -154,12 +153,6 @@ class SAC(Algorithm):
         self._began: Tensor
         """Of each env, which of them its episode began with."""
         self.restart()
-
-    def _use_16_bits(self) -> None:
-        """Compute pictures' maps in 16 bits where the processor does so at speed."""
-        vision = self.agent.encoder.vision
-        if isinstance(vision, CellVision) and torch.cpu._is_avx512_bf16_supported():
-            vision.dtype = torch.bfloat16
 
     def keep_in(self, folder: Path) -> None:
         """Keep the replay there."""
@@ -194,7 +187,7 @@ class SAC(Algorithm):
 
     def _simulated(self, state: State) -> State:
         """Return what critics read of a state, before it is put together."""
-        scene = Snapshot.unpack(state["snapshot"], self.hindsight.fingers)
+        scene = self._scene(state["snapshot"])
         goal = self.pursuit.look(scene, state["text"])
         now = {f"now.{k}": state[k][:, 0] for k in ("proprioception", "target")}
         kept = {name: state[name] for name in ("joint_velocity", "snapshot")}
@@ -232,7 +225,7 @@ class SAC(Algorithm):
 
     def _keep(self, episode: State) -> None:
         """Judge an episode under several sentences, and add it to the replay."""
-        scenes = Snapshot.unpack(episode["snapshot"], self.hindsight.fingers)
+        scenes = self._scene(episode["snapshot"])
         (said,) = read_text(episode.pop("text")[:1])
         found, judged = self.hindsight.choose(scenes, said)
         sentences = self.hindsight.read(found, self._sentence)
@@ -265,8 +258,9 @@ class SAC(Algorithm):
             self._improve_critics(now)
             if turn % 2 == 0:
                 self._improve_teacher(now)
-        for _ in range(self.config.imitations):
-            self._imitate(self._draw_seen())
+        if self.replay.written > self.config.policy_from:
+            for _ in range(self.config.imitations):
+                self._imitate(self._draw_seen())
         if self.updates % LOGGED:
             return {}
         history = sorted(self._history.items())  # a table's columns keep their order
@@ -319,9 +313,12 @@ class SAC(Algorithm):
         }
         return now | kept | {"goal": replay.read("goal", rows, column=which).float()}
 
+    def _scene(self, rows: Tensor) -> Snapshot:
+        return Snapshot.unpack(rows, self.hindsight.fingers)
+
     def _known(self, read: State) -> Tensor:
         """Return what critics and teacher read [B, D]."""
-        scene = simulated(Snapshot.unpack(read["snapshot"], self.hindsight.fingers))
+        scene = simulated(self._scene(read["snapshot"]))
         speed = (read["joint_velocity"] / 10).clamp(-1, 1)
         felt = read["now.proprioception"], read["now.target"]
         return torch.cat([*felt, speed, scene, read["goal"]], dim=1)
@@ -360,11 +357,18 @@ class SAC(Algorithm):
         """Do what the teacher does, and tell where the named object is."""
         with torch.no_grad():
             shown = self._taught(self._known(now)).mean
-        aligned = self.agent.encoder(now)
-        loss = functional.mse_loss(self.agent.actor(aligned).mean, shown)
+        encoder, scene = self.agent.encoder, self._scene(now["snapshot"])
+        with in_16_bits():
+            aligned = encoder(now)
+            mean = self.agent.actor(aligned).mean
+        loss = functional.mse_loss(mean, shown)
         self._note(imitation=loss)
+        if isinstance(encoder.vision, ObjectVision):
+            misseen = encoder.vision.misseen(aligned[:, encoder.seen], scene)
+            loss = loss + misseen
+            self._note(misseen=misseen)
         if self.agent.locator is not None:
-            guess, truth = self.agent.locator(aligned), now["named"]
+            guess, truth = self.agent.locator(aligned.float()), now["named"]
             off = 2 * functional.huber_loss(guess / LENGTH, truth / LENGTH)
             loss = loss + self.agent.config.auxiliary_weight * off
             self._note(auxiliary=off, off=(guess - truth).norm(dim=1).median())

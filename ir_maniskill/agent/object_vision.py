@@ -1,0 +1,180 @@
+"""Vision in two steps: what lies where, then which of that the sentence means.
+
+Legend: N states, S stacked observations, K cameras, H x W pixels, T cells of a picture,
+O kinds of objects (each color in each shape), C objects, D units.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from ir_maniskill.goals import COLORS, SHAPES
+from ir_maniskill.snapshot import Snapshot
+
+CELL, CHANNELS, WIDTH = 4, 32, 128
+"""Side of a cell [pixel], maps of a camera, units of what is found."""
+HEADS, ROUNDS, NAME = 4, 2, 16
+"""Objects looked at together, how often in a row, units of a kind's name."""
+KINDS = len(COLORS) * len(SHAPES)
+"""O."""
+LENGTH = 0.1
+"""What places are divided by [m]."""
+SHARP = 6.0
+"""Factor of how well a cell fits a kind, so that few cells count from the start."""
+
+
+def kinds() -> Tensor:
+    """Return the color and the shape of each kind of object, as flags [O, 10]."""
+    color = torch.eye(len(COLORS)).repeat_interleave(len(SHAPES), dim=0)
+    return torch.cat([color, torch.eye(len(SHAPES)).repeat(len(COLORS), 1)], dim=1)
+
+
+def truth(scene: Snapshot) -> tuple[Tensor, Tensor]:
+    """Return which kinds lie there [N, O], and where [N, O, 3], 0 for the others.
+
+    Places are divided by `LENGTH`.
+    """
+    kind = (scene.color * len(SHAPES) + scene.shape).where(scene.color >= 0, KINDS)
+    there = scene.position.new_zeros(len(kind), KINDS + 1).scatter(1, kind, 1.0)
+    place = scene.position.new_zeros(len(kind), KINDS + 1, 3)
+    place.scatter_(1, kind[..., None].expand(-1, -1, 3), scene.position / LENGTH)
+    return there[:, :KINDS], place[:, :KINDS]
+
+
+def cells(images: Tensor) -> Tensor:
+    """Cut uint8 images [N, S, K, H, W, 3] into cells [K, N, H / 4, W / 4, S * 48].
+
+    The 12 bytes of a cell's row move as three words: one by one they take four times
+    as long.
+    """
+    n, s, k, h, w, _ = images.shape
+    high, wide = h // CELL, w // CELL
+    images = images[:, :, :, : high * CELL, : wide * CELL].contiguous()
+    words = images.view(n, s, k, high, CELL, wide, 3 * CELL).view(torch.int32)
+    return words.permute(2, 0, 3, 5, 1, 4, 6).flatten(4).contiguous().view(torch.uint8)
+
+
+class CameraView(nn.Module):
+    """What one camera sees of each kind of object, where it fits best."""
+
+    def __init__(self, frames: int, high: int, wide: int) -> None:
+        """Make the layers for `frames` stacked images of so many cells."""
+        super().__init__()
+        self.cells = nn.Linear(3 * frames * CELL**2, CHANNELS)
+        self.convolution = nn.Conv2d(CHANNELS, CHANNELS, 3, padding=1)
+        self.fit = nn.Linear(CHANNELS, kinds().shape[1], bias=False)
+        places = torch.linspace(-1, 1, high), torch.linspace(-1, 1, wide)
+        grid = torch.stack(torch.meshgrid(*places, indexing="ij"), dim=-1)
+        self.register_buffer("grid", grid.flatten(0, 1), persistent=False)
+        self.register_buffer("kinds", kinds(), persistent=False)
+
+    def forward(self, cells: Tensor) -> Tensor:
+        """Return where each kind fits, how well, and the maps there [N, O, 3 + D]."""
+        maps = _normed(self.read(cells))
+        maps = self.convolution(maps.permute(0, 3, 1, 2))  # channels stay last
+        maps = _normed(maps.permute(0, 2, 3, 1)).flatten(1, 2)  # [N, T, D]
+        # A kind fits as well as its color and its shape do.
+        asked = SHARP * self.kinds @ self.fit.weight  # [O, D]
+        fits = (maps @ asked.T.to(maps.dtype)).transpose(1, 2).contiguous()  # [N, O, T]
+        looks = fits.softmax(dim=2)
+        at, best = looks @ self.grid.to(looks.dtype), fits.amax(dim=2, keepdim=True)
+        return torch.cat([at, best / 4, looks @ maps], dim=2)
+
+    def read(self, cells: Tensor) -> Tensor:
+        """Return a linear map of cells [N, H, W, S * 48] as numbers from -1 to 1."""
+        # Bytes are exact in 16 bits, and scaling weights is less than scaling them.
+        weight = self.cells.weight * (2 / 255)
+        bias = self.cells.bias - self.cells.weight.sum(dim=1)
+        fast = torch.is_autocast_enabled("cpu")
+        number = torch.get_autocast_dtype("cpu") if fast else weight.dtype
+        return functional.linear(cells.to(number), weight, bias)
+
+
+def _normed(maps: Tensor) -> Tensor:
+    """Return maps [N, H, W, C] normalized over channels, so that no cell is blind."""
+    return functional.relu(functional.layer_norm(maps, maps.shape[-1:]), inplace=True)
+
+
+class Finder(nn.Module):
+    """Attention of the sentence to what lies there; who looks again knows more."""
+
+    def __init__(self, said: int) -> None:
+        """Make the layers for `said` units of G_t."""
+        super().__init__()
+        self.entry = nn.Sequential(nn.Linear(NAME + 4, 64), nn.ReLU())
+        sizes = [said] + [said + WIDTH] * (ROUNDS - 1)
+        self.queries = nn.ModuleList(nn.Linear(size, WIDTH) for size in sizes)
+        self.keys = nn.ModuleList(nn.Linear(64, WIDTH) for _ in sizes)
+        self.values = nn.ModuleList(nn.Linear(64, WIDTH) for _ in sizes)
+        self.joins = nn.ModuleList(
+            nn.Sequential(
+                nn.Linear(WIDTH + size, WIDTH), nn.LayerNorm(WIDTH), nn.ReLU()
+            )
+            for size in sizes
+        )
+
+    def forward(self, entries: Tensor, there: Tensor, said: Tensor) -> Tensor:
+        """Return what is found [N, WIDTH] among entries [N, O, NAME + 4].
+
+        `there` are logits [N, O]: what does not lie there is not looked at.
+        """
+        entries = self.entry(entries)
+        absent = functional.logsigmoid(there.float()).clamp(min=-9)[:, None, None]
+        known, found = said, said
+        layers = zip(self.queries, self.keys, self.values, self.joins, strict=True)
+        for query, key, value, join in layers:
+            asked, *told = (
+                _heads(each)
+                for each in (query(known)[:, None], key(entries), value(entries))
+            )
+            mask = absent.to(asked.dtype).expand(-1, HEADS, -1, -1)
+            seen = functional.scaled_dot_product_attention(asked, *told, attn_mask=mask)
+            found = join(torch.cat([seen.flatten(1), known], dim=1))
+            known = torch.cat([said, found], dim=1)
+        return found
+
+
+def _heads(values: Tensor) -> Tensor:
+    """Split units [N, O, D] by heads [N, heads, O, D / heads]."""
+    return values.unflatten(2, (HEADS, -1)).transpose(1, 2)
+
+
+class ObjectVision(nn.Module):
+    """V_t: what was found, then which kinds lie there, and where: O and 3 O numbers."""
+
+    width = WIDTH + 4 * KINDS
+
+    def __init__(self, frames: int, size: tuple[int, int, int], said: int) -> None:
+        """Make the nets for images of `size` (cameras, height, width)."""
+        super().__init__()
+        count, high, wide = size[0], size[1] // CELL, size[2] // CELL
+        self.cameras = nn.ModuleList(
+            CameraView(frames, high, wide) for _ in range(count)
+        )
+        self.name = nn.Linear(kinds().shape[1], NAME)
+        inputs = count * (3 + CHANNELS) + NAME
+        hidden = nn.Linear(inputs, 64), nn.LayerNorm(64), nn.ReLU()
+        self.place = nn.Sequential(*hidden, nn.Linear(64, 4))
+        self.finder = Finder(said)
+        self.register_buffer("kinds", kinds(), persistent=False)
+
+    def forward(self, images: Tensor, language: Tensor) -> Tensor:
+        """Return V_t [N, D] of images [N, S, K, H, W, 3], seen as G_t [N, D'] asks."""
+        views = zip(self.cameras, cells(images), strict=True)
+        names = self.name(self.kinds).expand(len(images), -1, -1)  # [N, O, NAME]
+        seen = torch.cat([*(camera(each) for camera, each in views), names], dim=2)
+        there, *place = self.place(seen).float().unbind(dim=2)
+        likely = there.sigmoid()
+        lies = torch.stack([likely, *(axis * likely for axis in place)], dim=2)
+        found = self.finder(torch.cat([names, lies], dim=2), there, language)
+        return torch.cat([found, *lies.unbind(dim=2)], dim=1)
+
+    def misseen(self, seen: Tensor, scene: Snapshot) -> Tensor:
+        """Return how far V_t [N, D] is off what lies there, a mean over the states."""
+        there, place = truth(scene)
+        likely, *places = seen[:, WIDTH:].float().split(KINDS, dim=1)
+        wrong = functional.binary_cross_entropy(likely, there, reduction="sum")
+        off = functional.huber_loss(torch.stack(places, 2), place, reduction="sum")
+        return (0.2 * wrong + off) / len(seen)
