@@ -8,7 +8,6 @@ from torch.nn import functional
 from toy_envs import HANDS, LENGTH, TASK, ToyVectorEnv, toy_sac
 
 from ir_maniskill.agent.actor import Squashed
-from ir_maniskill.agent.object_vision import CameraView, cells
 from ir_maniskill.checks import ConfigError
 from ir_maniskill.environment.reward_generator import RewardWeights
 from ir_maniskill.environment.senses import StateStack
@@ -59,24 +58,6 @@ def test_both_critics_are_plain_networks_side_by_side() -> None:
                 x = functional.relu(functional.layer_norm(x, x.shape[1:]))
         # Products may be in 16 bits.
         torch.testing.assert_close(both[index], x[:, 0], rtol=0.02, atol=0.01)
-
-
-def test_cells_are_the_pixels_of_squares() -> None:
-    torch.manual_seed(0)
-    images = torch.randint(256, (2, 3, 2, 8, 12, 3), dtype=torch.uint8)
-    found = cells(images)
-    assert found.shape == (2, 2, 2, 3, 3 * 48)
-    square = images[1, :, 0, 4:8, 8:12]  # frames, rows, columns, colors
-    assert found[0, 1, 1, 2].tolist() == square.flatten().tolist()
-
-
-def test_bytes_are_seen_as_numbers_from_minus_one_to_one() -> None:
-    torch.manual_seed(0)
-    camera = CameraView(1, high=2, wide=2)
-    byte = torch.randint(256, (1, 2, 2, 48), dtype=torch.uint8)
-    weight, bias = camera.cells.parameters()
-    expected = functional.linear(byte * (2 / 255) - 1, weight, bias)
-    torch.testing.assert_close(camera.read(byte), expected)
 
 
 # -- The algorithm ---------------------------------------------------------------------

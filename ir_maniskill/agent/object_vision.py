@@ -142,7 +142,7 @@ def _heads(values: Tensor) -> Tensor:
 
 
 class ObjectVision(nn.Module):
-    """V_t: what was found, then which kinds lie there, and where: O and 3 O numbers."""
+    """V_t: what was found; then of each kind a logit that it lies there, and where."""
 
     width = WIDTH + 4 * KINDS
 
@@ -165,16 +165,17 @@ class ObjectVision(nn.Module):
         views = zip(self.cameras, cells(images), strict=True)
         names = self.name(self.kinds).expand(len(images), -1, -1)  # [N, O, NAME]
         seen = torch.cat([*(camera(each) for camera, each in views), names], dim=2)
-        there, *place = self.place(seen).float().unbind(dim=2)
-        likely = there.sigmoid()
-        lies = torch.stack([likely, *(axis * likely for axis in place)], dim=2)
-        found = self.finder(torch.cat([names, lies], dim=2), there, language)
-        return torch.cat([found, *lies.unbind(dim=2)], dim=1)
+        there, place = self.place(seen).float().split((1, 3), dim=2)
+        lies = torch.cat([names, there.sigmoid(), place], dim=2)
+        found = self.finder(lies, there.squeeze(2), language)
+        return torch.cat([found, there.squeeze(2), place.flatten(1)], dim=1)
 
     def misseen(self, seen: Tensor, scene: Snapshot) -> Tensor:
         """Return how far V_t [N, D] is off what lies there, a mean over the states."""
         there, place = truth(scene)
-        likely, *places = seen[:, WIDTH:].float().split(KINDS, dim=1)
-        wrong = functional.binary_cross_entropy(likely, there, reduction="sum")
-        off = functional.huber_loss(torch.stack(places, 2), place, reduction="sum")
-        return (0.2 * wrong + off) / len(seen)
+        told, placed = seen[:, WIDTH:].float().split((KINDS, 3 * KINDS), dim=1)
+        wrong = functional.binary_cross_entropy_with_logits(
+            told, there, reduction="sum"
+        )
+        off = functional.huber_loss(placed.view_as(place), place, reduction="none")
+        return (0.2 * wrong + (off.sum(dim=2) * there).sum()) / len(seen)
