@@ -304,7 +304,7 @@ class Push(Goal):
         holds = (along >= asked.distance) & (aside <= Push.STRAIGHT * along)
         strayed = (aside - Push.STRAIGHT * along.clamp(min=0)).clamp(min=0)
         gap = ((asked.distance - along).clamp(min=0) + strayed).masked_fill(holds, 0.0)
-        progress = Push.LEVEL * (along / asked.distance).clamp(-1, 1)
+        progress = Push.LEVEL * (along / asked.distance).clamp(0, 1)
         serves = asked.ref[:, None].expand_as(scene.contact)
         behind = -Push.BEHIND * asked.ref[..., None] * asked.direction[:, None]
         return Measure(
