@@ -72,8 +72,7 @@ def test_it_learns_to_touch_what_the_sentence_names(tmp_path) -> None:
 
 def test_steps_are_drawn_with_the_sentence_that_they_are_judged_under(tmp_path) -> None:
     algorithm = collected(tmp_path, ToyVectorEnv(snapshots=True))
-    sizes = {"batch": 600, "policy_batch": 600}
-    algorithm.config = dataclasses.replace(algorithm.config, **sizes)
+    algorithm.config = dataclasses.replace(algorithm.config, batch=600)
     drawn, seen = same(algorithm._draw), same(algorithm._draw_seen)
     goal = torch.where(seen["instruction"][:, 1] == 4, -0.6, 0.6)  # token 4: "left"
     off = (drawn["next.now.proprioception"][:, 0] - goal).abs()
@@ -111,7 +110,9 @@ def test_the_policy_acts_in_ever_more_of_the_envs(tmp_path) -> None:
     algorithm = collected(tmp_path, envs := ToyVectorEnv(4, snapshots=True))
     algorithm.agent.policy = lambda state: torch.full((len(state["touch"]), 2), 5.0)
     state = StateStack(1).reset(envs.reset(seed=0)[0])
-    algorithm.config = dataclasses.replace(algorithm.config, policy_acts=0.5)
+    algorithm.config = dataclasses.replace(
+        algorithm.config, policy_acts=0.5, policy_from=0.0
+    )
     by_policy = []
     for share in (0.0, 0.5, 1.0):
         algorithm.share = share
@@ -129,7 +130,7 @@ def test_the_policy_learns_to_do_what_the_teacher_does(tmp_path) -> None:
             done = algorithm.agent.actor(algorithm.agent.encoder(seen)).mean
             return float((shown - done).square().mean())
 
-    before, algorithm.updates = off(), 1000
+    before, algorithm.share = off(), 0.5
     for _ in range(60):
         algorithm._imitate(algorithm._draw_seen())
     assert off() < 0.3 * before

@@ -175,7 +175,7 @@ def toy_sac(out, **changes):
         actor="squashed",
         critic="none",
     )
-    learner = SACConfig(capacity=2000, random_steps=64, first_steps=128, batch=64)
+    learner = SACConfig(capacity=2000, random_steps=128, batch=64, policy_from=0.2)
     values = {"algorithm": "sac", "frames": 1, "agent": agent, "sac": learner}
     return toy_config(out, **(values | {"ppo": PPOConfig()} | changes))
 

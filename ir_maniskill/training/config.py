@@ -79,27 +79,24 @@ class PPOConfig:
 class SACConfig:
     """Soft actor-critic with hindsight: episodes are judged under many sentences."""
 
-    capacity: int = 150_000
+    capacity: int = 200_000
     """Steps that the replay has room for; the oldest make room."""
-    random_steps: int = 2_000
-    """Steps at the start whose actions are random, over all envs."""
-    first_steps: int = 3_000
-    """Steps after which learning begins."""
+    random_steps: int = 3_000
+    """Steps at the start whose actions are random; learning begins after them."""
     others: int = 8
     """Sentences under which an episode is judged beside its own, at most."""
     own: float = 0.1
     """Share of the steps that are learned from under what was said; the rest is under
     any of its sentences."""
     batch: int = 256
-    """Steps of each gradient of critics and teacher."""
+    """Steps of each gradient."""
     gradients: int = 4
     """Gradients of the critics for each step of all envs; the teacher has half of
     them."""
-    policy_batch: int = 256
-    """States of each gradient of the policy."""
-    policy_from: int = 0
-    """Steps before the policy begins to learn: there is little to imitate yet."""
-    imitations: int = 1
+    policy_from: float = 0.47
+    """Share of the training before the policy begins to learn, less than 1: at first
+    there is little to imitate."""
+    imitations: int = 2
     """Gradients of the policy for each step of all envs, from then on."""
     policy_acts: float = 0.75
     """Share of the envs in which the policy acts at the end, and none at the start."""
@@ -117,13 +114,13 @@ class SACConfig:
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
         require_types(self)
-        positive = "capacity first_steps batch gradients policy_batch"
+        positive = "capacity random_steps batch gradients"
         require_fields(self, positive, lambda x: x > 0, "at least 1")
-        unsigned = "random_steps others policy_from imitations"
-        require_fields(self, unsigned, lambda x: x >= 0, "0 or more")
-        require_fields(
-            self, "gamma own policy_acts polyak", lambda x: 0 <= x <= 1, "0 to 1"
-        )
+        require_fields(self, "others imitations", lambda x: x >= 0, "0 or more")
+        shares = "gamma own policy_acts polyak"
+        require_fields(self, shares, lambda x: 0 <= x <= 1, "0 to 1")
+        begun = "0 or more, less than 1"
+        require_fields(self, "policy_from", lambda x: 0 <= x < 1, begun)
         above = "learning_rate policy_rate reward_scale"
         require_fields(self, above, lambda x: 0 < x < math.inf, "more than 0")
 
@@ -249,7 +246,7 @@ CONFIGS: dict[str, TrainConfig] = {
     "default": TrainConfig(),
     "listen": TrainConfig(
         algorithm="sac",
-        total_steps=100_000,
+        total_steps=255_000,
         threads=1,
         frames=1,
         penalty_warmup=0.0,

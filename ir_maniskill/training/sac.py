@@ -49,8 +49,8 @@ TEMPERATURE_RATE = 1e-3
 """Adam's step size of its logarithm."""
 ENTROPY = 0.25
 """Entropy of each number of an action that the temperature aims at [nat]."""
-WARMUP = 300
-"""Updates in which the policy's step size grows."""
+WARMUP = 0.03
+"""Share of the policy's training in which its step size grows."""
 LONGEST = 10.0
 """Longest gradient of a step."""
 LOGGED = 64
@@ -173,7 +173,7 @@ class SAC(Algorithm):
             action = torch.rand(count, self.actions) * 2 - 1
         else:
             action, _ = self._taught(known).rsample()
-            by_policy = round(self.config.policy_acts * self.share * count)
+            by_policy = round(self.config.policy_acts * self._schooling * count)
             if by_policy:
                 some = {name: value[:by_policy] for name, value in state.items()}
                 action[:by_policy] = self.agent.policy(some)
@@ -250,7 +250,7 @@ class SAC(Algorithm):
 
     def update(self) -> dict[str, float]:
         """Make some gradients, once there is enough to learn from."""
-        if self.replay.written < self.config.first_steps:
+        if self.replay.written < self.config.random_steps:
             return {}
         self.updates += 1
         for turn in range(self.config.gradients):
@@ -258,7 +258,7 @@ class SAC(Algorithm):
             self._improve_critics(now)
             if turn % 2 == 0:
                 self._improve_teacher(now)
-        if self.replay.written > self.config.policy_from:
+        if self._schooling > 0:
             for _ in range(self.config.imitations):
                 self._imitate(self._draw_seen())
         if self.updates % LOGGED:
@@ -289,7 +289,7 @@ class SAC(Algorithm):
     def _draw_seen(self) -> State:
         """Return a batch of states as the policy perceives them, and the truth."""
         replay = self.replay
-        rows, which = self._rows(self.config.policy_batch)
+        rows, which = self._rows(self.config.batch)
         sensed = self.agent.encoder.sensed
         seen = {name: replay.read(name, rows, frames=self.frames) for name in sensed}
         seen |= {k: replay.read(k, rows, column=which) for k in self._sentence}
@@ -375,10 +375,16 @@ class SAC(Algorithm):
         self._optimizers["agent"].param_groups[0]["lr"] = self._policy_rate()
         self._step("agent", loss)
 
+    @property
+    def _schooling(self) -> float:
+        """Which share of its own training the policy has behind it."""
+        begun = self.config.policy_from
+        return max(0.0, (self.share - begun) / (1 - begun))
+
     def _policy_rate(self) -> float:
         """Return Adam's step size: it grows at first, and shrinks in the last third."""
-        grown, left = self.updates / WARMUP, 3 * (1 - self.share)
-        return self.config.policy_rate * min(grown, left + 0.02, 1.0)
+        grown, left = self._schooling / WARMUP, 3 * (1 - self._schooling)
+        return self.config.policy_rate * min(grown + 0.02, left + 0.02, 1.0)
 
     def _step(self, name: str, loss: Tensor) -> None:
         """Make one step of an optimizer; the others' weights get no gradient."""
