@@ -21,7 +21,7 @@ KINDS = len(COLORS) * len(SHAPES)
 """O."""
 LENGTH = 0.1
 """What places are divided by [m]."""
-SHARP = 6.0
+SHARP = 12.0
 """Factor of how well a cell fits a kind, so that few cells count from the start."""
 
 
@@ -63,24 +63,28 @@ class CameraView(nn.Module):
         """Make the layers for `frames` stacked images of so many cells."""
         super().__init__()
         self.cells = nn.Linear(3 * frames * CELL**2, CHANNELS)
-        self.convolution = nn.Conv2d(CHANNELS, CHANNELS, 3, padding=1)
-        self.fit = nn.Linear(CHANNELS, kinds().shape[1], bias=False)
+        self.convolutions = nn.ModuleList(
+            nn.Conv2d(CHANNELS, CHANNELS, 3, padding=1) for _ in range(2)
+        )
+        self.fit = nn.Linear(CHANNELS, kinds().shape[1])
         places = torch.linspace(-1, 1, high), torch.linspace(-1, 1, wide)
         grid = torch.stack(torch.meshgrid(*places, indexing="ij"), dim=-1)
         self.register_buffer("grid", grid.flatten(0, 1), persistent=False)
         self.register_buffer("kinds", kinds(), persistent=False)
 
     def forward(self, cells: Tensor) -> Tensor:
-        """Return where each kind fits, how well, and the maps there [N, O, 3 + D]."""
+        """Return how well each kind fits, where, and the maps there [N, O, 3 + D]."""
         maps = _normed(self.read(cells))
-        maps = self.convolution(maps.permute(0, 3, 1, 2))  # channels stay last
-        maps = _normed(maps.permute(0, 2, 3, 1)).flatten(1, 2)  # [N, T, D]
+        for convolve in self.convolutions:
+            maps = convolve(maps.permute(0, 3, 1, 2))  # in memory, channels stay last
+            maps = _normed(maps.permute(0, 2, 3, 1))
+        maps = maps.flatten(1, 2)  # [N, T, D]
         # A kind fits as well as its color and its shape do.
-        asked = SHARP * self.kinds @ self.fit.weight  # [O, D]
-        fits = (maps @ asked.T.to(maps.dtype)).transpose(1, 2).contiguous()  # [N, O, T]
+        fits = SHARP * self.fit(maps) @ self.kinds.T.to(maps.dtype)
+        fits = fits.transpose(1, 2).contiguous()  # [N, O, T]
         looks = fits.softmax(dim=2)
-        at, best = looks @ self.grid.to(looks.dtype), fits.amax(dim=2, keepdim=True)
-        return torch.cat([at, best / 4, looks @ maps], dim=2)
+        best, at = fits.amax(dim=2, keepdim=True), looks @ self.grid.to(looks.dtype)
+        return torch.cat([best / SHARP, at, looks @ maps], dim=2)
 
     def read(self, cells: Tensor) -> Tensor:
         """Return a linear map of cells [N, H, W, S * 48] as numbers from -1 to 1."""
@@ -157,6 +161,10 @@ class ObjectVision(nn.Module):
         inputs = count * (3 + CHANNELS) + NAME
         hidden = nn.Linear(inputs, 64), nn.LayerNorm(64), nn.ReLU()
         self.place = nn.Sequential(*hidden, nn.Linear(64, 4))
+        self.sure = nn.Linear(count, 1)
+        nn.init.constant_(self.sure.weight, 0.3 * SHARP)
+        nn.init.constant_(self.sure.bias, -2.0)
+        """That something fits well says most of whether it is there."""
         self.finder = Finder(said)
         self.register_buffer("kinds", kinds(), persistent=False)
 
@@ -166,6 +174,8 @@ class ObjectVision(nn.Module):
         names = self.name(self.kinds).expand(len(images), -1, -1)  # [N, O, NAME]
         seen = torch.cat([*(camera(each) for camera, each in views), names], dim=2)
         there, place = self.place(seen).float().split((1, 3), dim=2)
+        best = seen[..., :: 3 + CHANNELS][..., : len(self.cameras)]  # of each camera
+        there = there + self.sure(best).float()
         lies = torch.cat([names, there.sigmoid(), place], dim=2)
         found = self.finder(lies, there.squeeze(2), language)
         return torch.cat([found, there.squeeze(2), place.flatten(1)], dim=1)

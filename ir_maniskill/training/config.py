@@ -102,7 +102,7 @@ class SACConfig:
     """Share of the envs in which the policy acts at the end, and none at the start."""
     learning_rate: float = 3e-4
     """Adam's step size of critics and teacher."""
-    policy_rate: float = 1e-3
+    policy_rate: float = 2e-3
     """Adam's step size of the policy."""
     gamma: float = 0.95
     """Discount of a step."""
