@@ -19,12 +19,7 @@ from ir_maniskill.agent.language_system import LexiconTransformer, TokenTransfor
 from ir_maniskill.environment.senses import text_of, tokens_of
 from ir_maniskill.language import words
 from ir_maniskill.language.grammar import SAID, words_by_mark
-from ir_maniskill.language.lexicon import (
-    Lexicon,
-    edit_distance,
-    function_words,
-    word_vectors,
-)
+from ir_maniskill.language.lexicon import Lexicon, function_words, word_vectors
 from ir_maniskill.language.tokens import split_words
 from ir_maniskill.training import checkpoint
 
@@ -74,21 +69,6 @@ def test_shares_are_a_softmax_over_the_nearest():
     assert len(shares) == 3 and sum(shares.values()) == pytest.approx(1)
     assert [*shares][:2] == ["purple", "blue"]
     assert sorted(shares.values(), reverse=True) == [*shares.values()]
-
-
-@pytest.mark.parametrize(
-    ("a", "b", "edits"),
-    [
-        ("touch", "touch", 0),
-        ("touch", "", 5),
-        ("toch", "touch", 1),  # one added
-        ("psuh", "push", 1),  # two swapped
-        ("yellow", "mellows", 2),
-        ("ca", "abc", 3),  # what was swapped is not changed again
-    ],
-)
-def test_edit_distance(a, b, edits):
-    assert edit_distance(a, b) == edit_distance(b, a) == edits
 
 
 @given(st.text() | st.text("abcdelrtu ", max_size=40))
