@@ -115,12 +115,12 @@ class Lexicon:
 
     def _mistyped(self, word: str) -> dict[str, float]:
         """Return the known word that a word of none is most alike in its letters."""
-        known = (
-            k for k in self.vocabulary[2:] if len(k) > 2 + (k not in self._content)
-        )
-        long = len(word) > 3  # three letters could be anything
-        nearest = get_close_matches(word, known if long else (), n=1, cutoff=ALIKE)
-        return dict.fromkeys(nearest, 1.0)
+        if len(word) < 4:  # three letters could be anything
+            return {}
+        known = [
+            k for k in self.vocabulary[2:] if len(k) > (2 if k in self._content else 3)
+        ]
+        return dict.fromkeys(get_close_matches(word, known, n=1, cutoff=ALIKE), 1.0)
 
 
 @cache
