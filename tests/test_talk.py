@@ -21,7 +21,7 @@ from ir_maniskill.language.tokens import VOCABULARY
 from ir_maniskill.talk import cards, film, live, meshes
 from ir_maniskill.talk.page import Page, side_by_side
 from ir_maniskill.talk.players import RANDOM, RandomMotion
-from ir_maniskill.talk.reading import LONGEST, clean, grounded, in_words, names, read
+from ir_maniskill.talk.reading import LONGEST, clean, grounded, in_words, read
 from ir_maniskill.talk.session import Run, Score, Session
 
 RED = "Touch the red cube."
@@ -92,7 +92,7 @@ def test_what_is_typed_is_brought_onto_one_line():
     ],
 )  # fmt: skip
 def test_goals_are_told_in_plain_words(goal, words):
-    assert in_words(grounded(goal, scene()), names(scene())) == words
+    assert in_words(grounded(goal, scene())) == words
 
 
 # -- The session -----------------------------------------------------------------------

@@ -408,16 +408,15 @@ class Session:
 
     def lights(self) -> dict[str, dict[str, str]]:
         """Return what each finger of each hand touches: "right", "wrong" or ""."""
-        verdict, states = self.env.verdict, []
+        verdict = self.env.verdict
         touching = self.scene.contact[0].any(dim=1)
-        for right, wrong, any_ in zip(
-            verdict.right[0], verdict.wrong[0], touching, strict=True
-        ):
-            state = "wrong" if wrong else "right" if right else ""
-            states.append(state if self.reading.goal else "touch" * bool(any_))
-        left = iter(states)
+        found = zip(verdict.right[0], verdict.wrong[0], touching, strict=True)
+        if self.reading.goal is None:
+            states = ("touch" if any_ else "" for _, _, any_ in found)
+        else:
+            states = ("wrong" if w else "right" if r else "" for r, w, _ in found)
         hands = self.env.agent.hands.items()
-        return {hand: {finger: next(left) for finger in mine} for hand, mine in hands}
+        return {hand: {f: next(states) for f in fingers} for hand, fingers in hands}
 
 
 def _visible(entity: sapien.Entity) -> bool:
