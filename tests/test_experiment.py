@@ -36,16 +36,7 @@ from ir_maniskill.goals import (
 )
 from ir_maniskill.language.tokens import VOCABULARY
 
-IDS = (
-    "NaoTouchCubeMulti-v1",
-    "NaoTouchButtonMulti-v1",
-    "NaoTouchCubeShuffled-v1",
-    "NaoTouchButtonShuffled-v1",
-    "NaoTouchCubeSingle-v1",
-    "NaoTouchButtonSingle-v1",
-    "NaoTouchCubeTriangle-v1",
-    "NaoTouchButtonTriangle-v1",
-)
+IDS = ir_maniskill.available()[:8]
 BLUE = TouchObject("blue", (0.20, 0.0))
 RED = TouchObject("red", (0.20, 0.10))
 SOUND, PINK, CUBE = Touch(Ref("red")), Touch(Ref("purple")), Touch(Ref(shape="cube"))

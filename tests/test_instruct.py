@@ -119,23 +119,6 @@ def test_training_has_thousands_of_sentences_of_forty_words() -> None:
 # -- Episodes --------------------------------------------------------------------------
 
 
-def play(env: gym.Env, seed: int, steps: int = 8) -> list[torch.Tensor]:
-    """Return what is observed of an episode of random actions."""
-    obs, _ = env.reset(seed=seed)
-    generator, seen = torch.Generator().manual_seed(seed), []
-    for _ in range(steps):
-        seen.append(torch.cat([x.flatten() for x in obs["extra"].values()]))
-        obs, *_ = env.step(2 * torch.rand(1, 26, generator=generator) - 1)
-    return seen
-
-
-def test_the_same_seed_gives_the_same_episode_whatever_was_before(env: gym.Env) -> None:
-    first = play(env, 3)
-    play(env, 4)
-    for a, b in zip(first, play(env, 3), strict=True):
-        assert torch.equal(a, b)
-
-
 def test_what_is_not_on_the_table_is_not_simulated(env: gym.Env) -> None:
     env.reset(seed=1)
     base = env.unwrapped
@@ -204,21 +187,6 @@ def test_what_cannot_be_told_changes_nothing(
     with pytest.raises(ValueError, match=message):
         base.tell(said)
     assert torch.equal(before[0], base.get_state()) and before[1] == base.instructions
-
-
-def test_a_state_brings_back_objects_and_sentence(env: gym.Env) -> None:
-    env.reset(seed=6)
-    base = env.unwrapped
-    env.step(torch.zeros(1, 26))
-    state, said, scene = base.get_state(), base.instructions, base.snapshot()
-    env.reset(seed=9)
-    assert base.instructions != said
-    base.set_state(state)
-    now = base.snapshot()
-    assert base.instructions == said
-    torch.testing.assert_close(base.get_state(), state, atol=1e-7, rtol=0)
-    for name in ("pose", "start", "color", "shape", "stage"):
-        assert torch.equal(getattr(scene, name), getattr(now, name)), name
 
 
 def test_what_a_reset_is_told_is_true_of_its_scene(env: gym.Env) -> None:

@@ -1,7 +1,5 @@
 """The instruction language: what is said, true of a scene, and held out of training."""
 
-import json
-from importlib import resources
 from random import Random
 
 import pytest
@@ -28,7 +26,6 @@ from ir_maniskill.language import (
     HELD_OBJECTS,
     HELD_PAIRS,
     KINDS,
-    SPLITS,
     SentenceError,
     Thing,
     count,
@@ -231,14 +228,6 @@ def test_all_sentences_of_a_goal_are_said_and_counted():
     assert 0.9 * count(goal) < len(said) <= count(goal)
 
 
-def test_all_colors_shapes_and_directions_have_words():
-    rng = Random(0)
-    for color in COLORS:
-        for shape in SHAPES:
-            for direction in DIRECTIONS:
-                say(Push(Ref(color, shape), direction), rng)
-
-
 # -- Drawing -------------------------------------------------------------------------
 
 
@@ -290,14 +279,6 @@ def test_relations_are_clear_to_see():
     assert {getattr(where, "kind", where) for where in wheres} == {"other_than"}
 
 
-def test_the_same_seed_draws_the_same():
-    def once():
-        rng = Random(5)
-        return [say(draw(SCENE, KINDS, rng), rng) for _ in range(50)]
-
-    assert once() == once()
-
-
 @pytest.mark.parametrize(
     ("kinds", "split", "message"),
     [
@@ -342,12 +323,6 @@ def test_goals_of_a_split_say_what_training_never_says(split):
         assert not of_training(say(goal, rng))
 
 
-def test_each_kind_can_be_drawn_in_each_split():
-    for split in SPLITS:
-        for kind in KINDS:
-            assert next(drawn(1, split, kinds=[kind]))
-
-
 def test_held_out_wording_is_never_said_in_training():
     rng = Random(0)
     for _, goal in drawn(1_000, "wording", 5):
@@ -377,8 +352,6 @@ def test_held_out_words_are_new():
     assert len(words()) >= 40
     assert not {"crimson", "shove", "poke", "simultaneously"} & set(words())
     assert set(words()) < set(words("wording"))
-    missing = {"can", "pyramid"} - set(SHAPES)
-    assert not missing & set(words())
 
 
 def test_counts_of_splits():
@@ -392,9 +365,3 @@ def test_counts_of_splits():
     assert new["touch"][0] == len(held) - both
     assert all(sentences > 4_000 for _, sentences in train.values())
     assert counts("places", kinds) == train
-
-
-def test_the_tables_are_ready_for_more_shapes():
-    path = resources.files("ir_maniskill.language") / "grammar.json"
-    shapes = json.loads(path.read_text())["words"]["shape"]
-    assert {"cube", "button", "can", "pyramid"} <= shapes.keys()
