@@ -19,13 +19,11 @@ from ir_maniskill.goals import (
     Goal,
     GoalError,
     Instruction,
-    Push,
-    Relation,
-    Touch,
 )
 from ir_maniskill.language import KINDS, Thing, draw, handwritten, say, words
 from ir_maniskill.language.grammar import RULES
 from ir_maniskill.language.lexicon import lexicon
+from ir_maniskill.language.splits import acts_of, refs_of
 from ir_maniskill.language.tokens import split_words
 
 PAGE = Path(__file__).parent.parent / "docs" / "language.md"
@@ -106,14 +104,11 @@ def right_sentences(said: Collection[Instruction], reader: Reader) -> Counter[st
 
 def named(goal: Goal) -> dict[str, set[str | None]]:
     """Return the colors, shapes and verbs that a sentence of a goal must have."""
-    inner = [ref.where.ref for ref in goal.refs if isinstance(ref.where, Relation)]
-    refs = (*goal.refs, *inner)
-    verbs = {Touch: "touch", Push: "push"}
-    parts = [verbs.get(type(part)) for part in goal.parts or (goal,)]
+    verbs = {verb.split()[0] for verb, _ in acts_of(goal)}
     return {
-        "color": {ref.color for ref in refs} - {None},
-        "shape": {ref.shape for ref in refs} - {None},
-        "verb": set(parts) - {None},
+        "color": {ref.color for ref in refs_of(goal)} - {None},
+        "shape": {ref.shape for ref in refs_of(goal)} - {None},
+        "verb": {"push" if verb == "push" else "touch" for verb in verbs},
     }
 
 

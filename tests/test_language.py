@@ -28,8 +28,6 @@ from ir_maniskill.language import (
     KINDS,
     SentenceError,
     Thing,
-    count,
-    counts,
     draw,
     handwritten,
     parse,
@@ -39,6 +37,7 @@ from ir_maniskill.language import (
     words,
 )
 from ir_maniskill.language.grammar import RULES
+from ir_maniskill.language.splits import refs_of
 from ir_maniskill.language.tokens import split_words
 from ir_maniskill.snapshot import Snapshot
 
@@ -102,12 +101,6 @@ def snapshot(scenes):
             start[n, c, :2] = torch.tensor([thing.x, thing.y])
     rest = dict.fromkeys(("contact", "fingertip", "pose", "velocity", "stage"))
     return Snapshot(**rest, color=color, shape=shape, start=start)
-
-
-def all_refs(goal):
-    """Return all references in a goal, also those in relations."""
-    inner = [ref.where.ref for ref in goal.refs if isinstance(ref.where, Relation)]
-    return [*goal.refs, *inner]
 
 
 def drawn(amount, split, seed=0, kinds=KINDS):
@@ -219,15 +212,6 @@ def test_a_goal_without_words_is_refused(goal):
         say(goal, Random(0))
 
 
-def test_all_sentences_of_a_goal_are_said_and_counted():
-    rng = Random(0)
-    goal = Touch(Ref(shape="cube"))
-    # 1 + 4 + 2 + 1 + 2 kinds of politeness, 4 + 1 + 4 verbs, "cube" and "block".
-    assert count(goal) == 10 * 9 * 2
-    said = {say(goal, rng) for _ in range(10_000)}
-    assert 0.9 * count(goal) < len(said) <= count(goal)
-
-
 # -- Drawing -------------------------------------------------------------------------
 
 
@@ -238,8 +222,8 @@ def test_every_reference_of_a_drawn_goal_fits_one_object(split):
     assert things(rows)[0] == tuple(
         t._replace(x=pytest.approx(t.x), y=pytest.approx(t.y)) for t in scenes[0]
     )
-    for ref in {ref for goal in goals for ref in all_refs(goal)}:
-        asked = torch.tensor([ref in all_refs(goal) for goal in goals])
+    for ref in {ref for goal in goals for ref in refs_of(goal)}:
+        asked = torch.tensor([ref in refs_of(goal) for goal in goals])
         assert (ref.resolve(rows).sum(dim=1)[asked] == 1).all(), ref
 
 
@@ -352,16 +336,3 @@ def test_held_out_words_are_new():
     assert len(words()) >= 40
     assert not {"crimson", "shove", "poke", "simultaneously"} & set(words())
     assert set(words()) < set(words("wording"))
-
-
-def test_counts_of_splits():
-    kinds = ("touch", "push")
-    train, new = counts("train", kinds), counts("objects", kinds)
-    held = [thing for thing in HELD_OBJECTS if thing[1] in SHAPES]
-    # All names, but not those held out, nor those that say "orange".
-    names = len(COLORS) * len(SHAPES) + len(COLORS) + len(SHAPES)
-    orange, both = len(SHAPES) + 1, sum(color == "orange" for color, _ in held)
-    assert train["touch"][0] == names - len(held) - orange + both
-    assert new["touch"][0] == len(held) - both
-    assert all(sentences > 4_000 for _, sentences in train.values())
-    assert counts("places", kinds) == train

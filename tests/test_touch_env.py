@@ -210,7 +210,7 @@ def test_actions_of_all_kinds_are_taken_and_those_not_finite_refused(
         ([0.0] * 25, r"got shape \(25,\), expected \(1, 26\)"),
         (torch.zeros(2, 26), r"got shape \(2, 26\)"),
         (np.zeros(26, complex), "got complex numbers"),
-        ("left", "got ndarray .*, expected numbers"),
+        ("left", "got str .*, expected numbers"),
     ):
         with pytest.raises(ValueError, match=message):
             fixed.step(bad)

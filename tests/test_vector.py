@@ -342,7 +342,7 @@ def test_actions_of_all_kinds_are_taken(envs: ProcessVectorEnv, kind: Any) -> No
         (np.full((3, 26), 1e300), "got NaN or infinity"),
         ([["left"] * 26] * 3, "got list .*expected numbers"),
         (torch.zeros(3, 26, dtype=torch.complex64), "complex numbers"),
-        (None, "actions: got"),
+        (None, "action: got"),
     ],
 )
 def test_wrong_actions_are_refused_and_no_env_steps(

@@ -139,13 +139,8 @@ class EvaluationReport:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
-        return {
-            "env_id": self.env_id,
-            "seed": self.seed,
-            "episodes": self.episodes,
-            "instructions": {k: v.as_dict() for k, v in self.instructions.items()},
-            "overall": self.overall.as_dict(),
-        }
+        each = {name: score.as_dict() for name, score in self.instructions.items()}
+        return {**vars(self), "instructions": each, "overall": self.overall.as_dict()}
 
     def __str__(self) -> str:
         rows = [*self.instructions.items(), ("all", self.overall)]
