@@ -89,15 +89,6 @@ def test_the_page_is_what_the_recorded_files_say():
     assert results.fill(page, results.tables()) == page
 
 
-def test_each_task_has_one_picture_with_a_curve_for_each_label(tmp_path):
-    own = [make_run(), make_run(seed=1, fingers=(2.0, 2.2))]
-    results.draw([*own, make_run(label="theirs"), make_run(TASKS[1])], tmp_path)
-    first = (tmp_path / f"{TASKS[0]}.png").read_bytes()
-    results.draw(own, tmp_path)
-    assert (tmp_path / f"{TASKS[0]}.png").read_bytes() != first
-    assert len(list(tmp_path.iterdir())) == 2
-
-
 def test_seeds_are_compared_at_every_step_that_each_has_reached():
     runs = [
         [{"steps": 0, "y": 0.0}, {"steps": 20, "y": 2.0}],

@@ -28,6 +28,8 @@ from ir_maniskill.goals import DIRECTIONS, SHAPES, Avoid, Goal, Push, Then, Touc
 from ir_maniskill.snapshot import Snapshot
 
 Array = NDArray[np.float64]
+Tips = tuple[int, ...]
+"""Which fingers of a hand touch."""
 
 # -- Weights of the least squares, each of a unit of its residual ----------------------
 
@@ -122,6 +124,8 @@ class Arm:
             names.index(n) for n in (*itertools.chain(*parts), palm, upper[1])
         ]
         count = np.cumsum([len(part) for part in parts])
+        balls = len(self._links) - 2 + len(chains), 5  # of fingers, of the rest
+        self._radii = np.repeat([FINGER, PALM], balls)  # of `Hand.balls` [P]
         self._first, self._last = count - [len(part) for part in parts], count - 1
         self.shoulder = articulation.links_map[moved[self.joints[0]]].pose.p[0].cpu()
         self.shoulder = self.shoulder.numpy().astype(float) / self.scale
@@ -146,7 +150,7 @@ class Arm:
 
     # -- Where it is -----------------------------------------------------------------
 
-    def hand(self, x: Array, tips: tuple[int, ...]) -> Hand:
+    def hand(self, x: Array, tips: Tips) -> Hand:
         """Return where the hand is with these numbers [X], touching with `tips`."""
         qpos = np.empty(len(self.rest))
         qpos[self._order] = self.to_joints(x, self.rest)
@@ -164,20 +168,16 @@ class Arm:
         balls = np.concatenate([fingers, pads, solid])
         return Hand(tip, _unit(tip - palm), _unit(across), balls)
 
-    def _radii(self, balls: Array) -> Array:
-        fingers = np.arange(balls.shape[-2]) < balls.shape[-2] - 5
-        return np.where(fingers, FINGER, PALM)
-
-    def miss(self, x: Array, tips: tuple[int, ...], aim: Aim) -> float:
+    def miss(self, x: Array, tips: Tips, aim: Aim) -> float:
         """Return how far the tip is from its aim, and the hand in what is there [m]."""
         hand = self.hand(x, tips)
-        room = clearance(hand.balls, self._radii(hand.balls), aim.boxes)
+        room = clearance(hand.balls, self._radii, aim.boxes)
         away = 0.0 if aim.tip is None else np.linalg.norm(hand.tip - aim.tip)
         return float(away + max(0.0, -room.min(initial=0.0)))
 
     # -- The numbers for an aim --------------------------------------------------------
 
-    def search(self, tips: tuple[int, ...], aim: Aim, starts: int = 4) -> Array:
+    def search(self, tips: Tips, aim: Aim, starts: int = 4) -> Array:
         """Return numbers for an aim, from the best of the postures tried before."""
         hands, low = self._tables[tips][1:]
         assert aim.tip is not None
@@ -185,13 +185,14 @@ class Arm:
         cost += STEEP**2 * ((hands.pointing - self._steep(aim.tip)) ** 2).sum(1)
         near = np.argpartition(cost, 150)[:150]
         for i in near:
-            room = clearance(hands.balls[i], self._radii(hands.balls[i]), aim.boxes)
+            room = clearance(hands.balls[i], self._radii, aim.boxes)
             cost[i] += AT_TIP**2 * (np.minimum(room - aim.margins, 0) ** 2).sum()
         best = near[np.argsort(cost[near])[:starts]]
         found = [self.improve(self._tables[tips][0][i], tips, aim, 15) for i in best]
-        return min(found, key=lambda x: self._cost(x, tips, aim, x))
+        residuals = [self._residual(x, tips, aim, x) for x in found]
+        return found[np.argmin([r @ r for r in residuals])]
 
-    def improve(self, x: Array, tips: tuple[int, ...], aim: Aim, steps: int) -> Array:
+    def improve(self, x: Array, tips: Tips, aim: Aim, steps: int) -> Array:
         """Return numbers nearer to an aim: damped least squares (Levenberg-Marquardt).
 
         dx = -(J^T J + lambda I)^-1 J^T r, with J by finite differences.
@@ -218,13 +219,10 @@ class Arm:
                 damping *= 8
         return x
 
-    def _residual(
-        self, x: Array, tips: tuple[int, ...], aim: Aim, first: Array
-    ) -> Array:
+    def _residual(self, x: Array, tips: Tips, aim: Aim, first: Array) -> Array:
         hand = self.hand(x, tips)
-        radii = self._radii(hand.balls)
-        room = clearance(hand.balls, radii, aim.boxes) - aim.margins
-        above = hand.balls[:, 2] - radii - TABLE_TOP - 0.004
+        room = clearance(hand.balls, self._radii, aim.boxes) - aim.margins
+        above = hand.balls[:, 2] - self._radii - TABLE_TOP - 0.004
         parts = [AT_TIP * np.minimum(np.append(room.ravel(), above), 0)]
         if aim.tip is None:
             return np.concatenate([*parts, x - first])
@@ -234,27 +232,23 @@ class Arm:
         tip = AT_TIP * (hand.tip - aim.tip)
         return np.concatenate([*parts, tip, pointing, STAY * (x - first)])
 
-    def _cost(self, *args: Any) -> float:
-        r = self._residual(*args)
-        return float(r @ r)
-
     def _steep(self, tip: Array) -> Array:
         """Return how the hand is to point at a place: down, and away from the body."""
         level = _unit((tip - self.shoulder) * (1, 1, 0))
         return 0.5 * level - np.array([0, 0, DOWN])
 
-    def _table(self, tips: tuple[int, ...], samples: int) -> tuple[Array, Hand, Array]:
+    def _table(self, tips: Tips, samples: int) -> tuple[Array, Hand, Array]:
         """Return random numbers, the hands that they make, and what these cost."""
         uniform = np.random.default_rng(0).uniform(size=(samples, len(self.joints) + 1))
         low, high = self._low[self.joints], self._high[self.joints]
         numbers = uniform * np.append(high - low, 1) + np.append(low, 0)
         tried = zip(*(self.hand(x, tips) for x in numbers), strict=True)
         hands = Hand(*map(np.array, tried))
-        above = (hands.balls[..., 2] - self._radii(hands.balls)).min(axis=1) - TABLE_TOP
+        above = (hands.balls[..., 2] - self._radii).min(axis=1) - TABLE_TOP
         return numbers, hands, AT_TIP**2 * np.minimum(above, 0) ** 2
 
 
-def _tips(fingers: int) -> list[tuple[int, ...]]:
+def _tips(fingers: int) -> list[Tips]:
     """Return which fingers of a hand may touch: the first two, or the last alone."""
     return [(0, 1), (fingers - 1,)] if fingers > 2 else [tuple(range(fingers))]
 
@@ -298,7 +292,7 @@ class Act:
     """What."""
     index: int
     """The object's place in the snapshot."""
-    tips: tuple[int, ...]
+    tips: Tips
     """Which fingers touch."""
     x: Array
     """Numbers of the hand at its way point [X]."""
@@ -407,11 +401,7 @@ class Scripted:
             if found is None:  # a push ends at once, a touch is held
                 return now if isinstance(act.goal, Push) else None
             tip, margin = found
-            push = (
-                np.array(DIRECTIONS[act.goal.direction])
-                if isinstance(act.goal, Push)
-                else None
-            )
+            push = _way(act.goal) if isinstance(act.goal, Push) else None
             if episode.steps <= LIFT:
                 aim = view.aim(episode.begun[hand] + (0, 0, 0.05), mine, 0.004)
                 x = arm.improve(now, tips, aim, 3)
@@ -449,7 +439,7 @@ class Scripted:
     def _push(
         self, act: Act, goal: Push, view: View, tip: Array
     ) -> tuple[Array, float] | None:
-        ahead = np.array(DIRECTIONS[goal.direction])
+        ahead = _way(goal)
         place, start = view.place(act.index), view.start(act.index)
         if (place - start) @ ahead >= goal.distance + 0.003:
             return None
@@ -516,14 +506,14 @@ class Scripted:
         goal: Touch | Push,
         arm: Arm,
         index: int,
-        tips: tuple[int, ...],
+        tips: Tips,
     ) -> tuple[Array, float]:
         """Return numbers over the object, and how far all way points are missed [m]."""
         place, over = view.place(index), view.top(index) + OVER
         push = None
         low = np.append(place[:2], over - OVER + 0.009)
         if isinstance(goal, Push):
-            push = np.array(DIRECTIONS[goal.direction])
+            push = _way(goal)
             low = np.append((place - BEHIND * push)[:2], LOW)
         aim = view.aim(low, [index], push=push)
         x = arm.search(tips, aim)
@@ -538,10 +528,14 @@ class Scripted:
 
     def _at_end(self, view: View, goal: Push, index: int) -> Aim:
         """Return the aim of a hand that has pushed something as far as it shall be."""
-        push, boxes = np.array(DIRECTIONS[goal.direction]), view.boxes.copy()
+        push, boxes = _way(goal), view.boxes.copy()
         boxes[index, :2] = (view.start(index) + goal.distance * push)[:2]
         tip = np.append((boxes[index, :3] - 0.027 * push)[:2], LOW)
         return Aim(tip, boxes, view.aim(tip, [index]).margins, push)
+
+
+def _way(goal: Push) -> Array:
+    return np.array(DIRECTIONS[goal.direction])
 
 
 class View:
