@@ -121,7 +121,8 @@ def sentences_table(policies: Mapping[str, Any]) -> str:
         for sentence, score in figures["instructions"].items():
             shares = [_share(score, name) for name in RATES]
             held = f"{score['holding']:.0%}", f"{score['right_fingers']:.1f}"
-            rows.append((f"`{task}`", _named(sentence), *shares, *held))
+            color = sentence.split()[-2]  # of "Touch the blue cube."
+            rows.append((f"`{task}`", color, *shares, *held))
     head = "task | named | success | exclusive | in touch | fingers"
     return table(head, rows)
 
@@ -147,11 +148,6 @@ def steps_to(run: Run, column: str, level: float) -> str:
 def _share(score: Mapping[str, Any], name: str) -> str:
     low, high = (100 * bound for bound in score[f"{name}_interval"])
     return f"{100 * score[name]:.1f}% [{low:.1f}, {high:.1f}]"
-
-
-def _named(sentence: str) -> str:
-    """Return the color in "Touch the blue cube."."""
-    return sentence.split()[-2]
 
 
 def _thousands(steps: float) -> str:

@@ -30,8 +30,9 @@ def seeds_of(seed: int | Sequence[int], num_envs: int) -> list[int]:
     """
     given = _plain(seed)
     seeds = [given + row for row in range(num_envs)] if _whole(given) else given
-    if isinstance(seeds, list) and len(seeds) == num_envs and _all_in(SEEDS, seeds):
-        return seeds
+    each = seeds if isinstance(seeds, list) else []
+    if len(each) == num_envs and all(_whole(one) and one in SEEDS for one in each):
+        return each
     raise ValueError(
         f"seed: got {short(given)}, expected an integer (env i gets seed + i) or "
         f"{num_envs} of them, so that each env's is from 0 to {SEEDS[-1]}"
@@ -210,7 +211,3 @@ def _plain(given: Any) -> Any:
 
 def _whole(given: Any) -> bool:
     return isinstance(given, int) and not isinstance(given, bool)
-
-
-def _all_in(numbers: range, given: list) -> bool:
-    return all(_whole(one) and one in numbers for one in given)
