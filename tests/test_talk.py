@@ -38,38 +38,30 @@ def heard(text):
     return read(text, KNOWN, scene(), VOCABULARY)
 
 
-@pytest.mark.parametrize("text", [RED, "touch the RED cube", "Touch, the red cube!"])
-def test_a_sentence_of_the_task_is_said_as_the_task_says_it(text):
-    reading = heard(text)
-    assert reading.said == RED and reading.goal == KNOWN[1].goal
-    assert reading.objects == (1,) and reading.unknown == ()
+PUSH = "Push the red cube to the left."
 
 
 @pytest.mark.parametrize(
-    "text", ["please tap the crimson block", "Touch the leftmost one."]
+    ("text", "said", "meaning", "unknown"),
+    [
+        ("Touch, the RED cube!", RED, "touch the red cube", ()),
+        # Other words for what the task asks for are said as its sentence.
+        ("please tap the crimson block", RED, "touch the red cube", ()),
+        ("Touch the leftmost one.", RED, "touch the red cube", ()),
+        (PUSH, PUSH, "push the red cube to the left", ("push", "to", "left")),
+    ],
 )
-def test_other_words_for_a_goal_of_the_task_are_said_as_its_sentence(text):
+def test_a_sentence_is_said_as_the_policy_knows_it(text, said, meaning, unknown):
     reading = heard(text)
-    assert reading.said == RED and reading.unknown == ()
-    assert reading.heard == clean(text) and reading.meaning == "touch the red cube"
-
-
-def test_what_the_task_does_not_ask_for_is_said_as_it_is():
-    reading = heard("Push the red cube to the left.")
-    assert reading.said == reading.heard and reading.goal == Push(
-        Ref("red", "cube"), "left"
-    )
-    assert reading.unknown == ("push", "to", "left")
-    assert reading.meaning == "push the red cube to the left"
+    assert (reading.heard, reading.said) == (clean(text), said)
+    assert (reading.meaning, reading.unknown) == (meaning, unknown)
+    assert reading.objects == (1,)
 
 
 def test_nonsense_has_no_goal_and_says_what_was_expected():
     reading = heard("Dance!")
     assert reading.goal is None and reading.unknown == ("dance",)
     assert "'dance' as word 1" in reading.meaning and reading.meaning.endswith("...")
-
-
-def test_an_object_that_is_not_there_is_told():
     reading = heard("Touch the purple cube.")
     assert reading.goal is None
     assert reading.meaning.startswith("the purple cube fits 0 objects here")
