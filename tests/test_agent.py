@@ -89,7 +89,7 @@ def test_encoders_are_known_by_name():
     with pytest.raises(ConfigError, match="language: got 'gpt', expected one of 'tok"):
         language(language="gpt")
     with pytest.raises(ConfigError, match="got 'tokens', expected one that is not tak"):
-        language_system.register("tokens", TokenTransformer)
+        language_system.register("tokens", language_system.LexiconTransformer)
 
 
 def test_repeated_sentences_are_encoded_alike_and_share_their_gradient():

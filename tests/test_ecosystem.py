@@ -190,15 +190,6 @@ def test_a_reset_to_a_state_may_have_a_seed(
     assert torch.equal(env.unwrapped.get_state(), begun)
 
 
-def test_a_state_and_another_instruction_are_refused(
-    to_states: tuple[Any, dict],
-) -> None:
-    env, states = to_states
-    to = {"reset_to_env_states": {"env_states": states["row"]}, "instruction": 0}
-    with pytest.raises(ValueError, match="and instruction 0, expected one"):
-        env.reset(options=to)
-
-
 @pytest.mark.parametrize("task", ["NaoTouchCubeShuffled-v1", "NaoInstruct-v1"])
 def test_maniskills_cached_resets_work_with_and_without_a_seed(task: str) -> None:
     env = CachedResetWrapper(blind(task), config={"num_resets": 2, "seed": 0})

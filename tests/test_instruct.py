@@ -16,6 +16,7 @@ from ir_maniskill.experiment import Drawn, Experiment, ExperimentError, Spoken
 from ir_maniskill.goals import COLORS, SHAPES, Instruction, Push, Ref, Touch
 from ir_maniskill.language import (
     HELD_OBJECTS,
+    HELD_PAIRS,
     SPLITS,
     handwritten,
     kind_of,
@@ -95,9 +96,12 @@ def test_sentences_are_of_their_split_and_true_of_their_scene(
         new = split if split in ("objects", "pairs") else "train"
         assert split_of(said.goal) == new
         if split != "objects":
-            meant = [resolve(ref, scene) for _, ref in acts_of(said.goal)]
+            acts = [(verb, resolve(ref, scene)) for verb, ref in acts_of(said.goal)]
+            meant = [index for _, index in acts]
             kinds = [(scene[i].color, scene[i].shape) for i in meant]
             assert not set(kinds) & HELD_OBJECTS
+            pairs = {(verb, scene[i].color) for verb, i in acts}
+            assert bool(pairs & HELD_PAIRS) == (split == "pairs")
             held = [task.objects.is_held_out(scene[i].x, scene[i].y) for i in meant]
             assert all(held) if split == "places" else not any(held)
 

@@ -3,7 +3,6 @@
 from random import Random
 
 import pytest
-import torch
 
 from ir_maniskill.goals import (
     COLORS,
@@ -23,8 +22,6 @@ from ir_maniskill.goals import (
     other_than,
 )
 from ir_maniskill.language import (
-    HELD_OBJECTS,
-    HELD_PAIRS,
     KINDS,
     SentenceError,
     Thing,
@@ -33,13 +30,10 @@ from ir_maniskill.language import (
     parse,
     say,
     split_of,
-    things,
     words,
 )
 from ir_maniskill.language.grammar import RULES
-from ir_maniskill.language.splits import refs_of
 from ir_maniskill.language.tokens import split_words
-from ir_maniskill.snapshot import Snapshot
 
 RED, BLUE = Ref("red"), Ref("blue", "cube")
 SCENE = (
@@ -88,21 +82,6 @@ def any_scene(rng):
     )
 
 
-def snapshot(scenes):
-    """Return scenes as a snapshot, each with an empty place before its objects."""
-    count = 1 + max(map(len, scenes))
-    color = torch.full((len(scenes), count), -1)
-    shape = torch.zeros_like(color)
-    start = torch.zeros(len(scenes), count, 7)
-    for n, scene in enumerate(scenes):
-        for c, thing in enumerate(scene, 1):
-            color[n, c] = [*COLORS].index(thing.color)
-            shape[n, c] = SHAPES.index(thing.shape)
-            start[n, c, :2] = torch.tensor([thing.x, thing.y])
-    rest = dict.fromkeys(("contact", "fingertip", "pose", "velocity", "stage"))
-    return Snapshot(**rest, color=color, shape=shape, start=start)
-
-
 def drawn(amount, split, seed=0, kinds=KINDS):
     """Yield scenes and goals that are true of them."""
     rng = Random(seed)
@@ -113,40 +92,6 @@ def drawn(amount, split, seed=0, kinds=KINDS):
         except GoalError:  # nothing to say of this one
             continue
         amount -= 1
-
-
-def meant(goal, scene):
-    """Return the objects that a goal means, each with what is done to it."""
-    found = []
-    for part in goal.parts or (goal,):
-        verb = "leave"
-        if isinstance(part, Push):
-            verb = f"push {part.direction}"
-        elif isinstance(part, Touch):
-            verb = f"{part.hand} hand" if part.hand else "touch"
-        found.append((verb, fitting(part.ref, scene)))
-        if isinstance(part.ref.where, Relation):
-            found.append(("find", fitting(part.ref.where.ref, scene)))
-    return found
-
-
-def fitting(ref, scene):
-    """Return the one object that a reference fits, found the slow way."""
-    color, shape, where = ref.color, ref.shape, ref.where
-    fits = [t for t in scene if color in (None, t.color) and shape in (None, t.shape)]
-    if isinstance(where, str):
-        axis, sign = EXTREMES[where]
-        fits = [max(fits, key=lambda t: sign * t[2 + axis])]
-    elif where:
-        other = fitting(where.ref, scene)
-        side = {
-            "left_of": lambda t: t.y > other.y,
-            "right_of": lambda t: t.y < other.y,
-            "other_than": lambda t: t is not other,
-        }
-        fits = list(filter(side[where.kind], fits))
-    (one,) = fits
-    return one
 
 
 # -- Saying and reading --------------------------------------------------------------
@@ -215,18 +160,6 @@ def test_a_goal_without_words_is_refused(goal):
 # -- Drawing -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("split", ["train", "objects", "pairs"])
-def test_every_reference_of_a_drawn_goal_fits_one_object(split):
-    scenes, goals = zip(*drawn(200, split), strict=True)
-    rows = snapshot(scenes)
-    assert things(rows)[0] == tuple(
-        t._replace(x=pytest.approx(t.x), y=pytest.approx(t.y)) for t in scenes[0]
-    )
-    for ref in {ref for goal in goals for ref in refs_of(goal)}:
-        asked = torch.tensor([ref in refs_of(goal) for goal in goals])
-        assert (ref.resolve(rows).sum(dim=1)[asked] == 1).all(), ref
-
-
 def test_drawn_goals_are_of_the_kind_asked_and_can_be_done():
     shown = {kind: {g for _, g in drawn(400, "train", 2, [kind])} for kind in KINDS}
     assert all(isinstance(g, Touch) and not g.hand for g in shown["touch"])
@@ -286,17 +219,12 @@ def of_training(sentence):
         return False
 
 
-def test_training_never_means_what_is_held_out():
+def test_training_says_nothing_that_is_held_out():
     rng, known = Random(0), set(words())
-    for number, (scene, goal) in enumerate(drawn(20_000, "train", 3)):
-        acts = meant(goal, scene)
-        assert split_of(goal) == "train"
-        assert not {thing[:2] for _, thing in acts} & HELD_OBJECTS
-        assert not {(verb, thing.color) for verb, thing in acts} & HELD_PAIRS
-        if number % 10 == 0:
-            text = say(goal, rng)
-            assert of_training(text)
-            assert set(split_words(text)) <= known
+    for _, goal in drawn(2_000, "train", 3):
+        text = say(goal, rng)
+        assert split_of(goal) == "train" and of_training(text)
+        assert set(split_words(text)) <= known
 
 
 @pytest.mark.parametrize("split", ["objects", "pairs"])
