@@ -78,8 +78,6 @@ class Score:
 class Run:
     """A run of an experiment: its sentences one after the other."""
 
-    task: str
-    """Id of the experiment."""
     sentences: tuple[str, ...]
     """What is said, in order."""
     reached: tuple[bool, ...] = ()
@@ -363,7 +361,7 @@ class Session:
     def experiment(self, task: str) -> None:
         """Run an experiment: each of its sentences once, in scenes of their own."""
         self.choose(task=task, robot=Nao.uid, policy=task)
-        self.run = Run(task, tuple(i.text for i in self._known()))
+        self.run = Run(tuple(i.text for i in self._known()))
         self._say(self.run.sentences[0])
 
     def _go_on(self) -> None:
