@@ -371,64 +371,48 @@ class Scripted:
             self._episodes[row] = episode = Episode(view.stage, 0, acts, {}, tips)
         episode.steps += 1
         for hand, arm in self.arms.items():
-            x = self._next(
-                arm, hand, episode, view, arm.numbers(now), arm.numbers(wanted)
-            )
+            x = self._next(hand, episode, view, now, wanted)
             if x is not None:
                 wanted[:] = arm.to_joints(x, wanted)
 
     def _next(
-        self,
-        arm: Arm,
-        hand: str,
-        episode: Episode,
-        view: View,
-        now: Array,
-        target: Array,
+        self, hand: str, episode: Episode, view: View, joints: Array, wanted: Array
     ) -> Array | None:
         """Return the next numbers of a hand; None: it stays as it is."""
-        act, mine = episode.acts.get(hand), [a.index for a in episode.acts.values()]
+        arm, act = self.arms[hand], episode.acts.get(hand)
+        now, target = arm.numbers(joints), arm.numbers(wanted)
+        lifts, start = episode.steps <= LIFT, episode.begun[hand]
         if act is None:
-            tips, mine = arm.tips[0], []
-            lifted = episode.begun[hand] + (0, 0, 0.06)
-            wait = lifted if episode.steps <= LIFT else ASIDE * (1, arm.side, 1)
-            aim = view.aim(wait, mine)
-            x = episode.idle.get(hand, now)
+            tips = arm.tips[0]
+            wait = np.add(start, (0, 0, 0.06)) if lifts else ASIDE * (1, arm.side, 1)
+            aim, x = view.aim(wait, []), episode.idle.get(hand, now)
             x = episode.idle[hand] = arm.improve(x, tips, aim, 1)
         else:
-            tips = act.tips
-            found = self._way_point(arm, hand, act, view, now)
+            tips, mine = act.tips, [a.index for a in episode.acts.values()]
+            found = self._way_point(hand, act, view, now)
             if found is None:  # a push ends at once, a touch is held
                 return now if isinstance(act.goal, Push) else None
-            tip, margin = found
-            push = _way(act.goal) if isinstance(act.goal, Push) else None
-            if episode.steps <= LIFT:
-                aim = view.aim(episode.begun[hand] + (0, 0, 0.05), mine, 0.004)
+            if lifts:
+                aim = view.aim(np.add(start, (0, 0, 0.05)), mine, 0.004)
                 x = arm.improve(now, tips, aim, 3)
             else:
-                aim = view.aim(tip, mine, margin, push)
+                aim = view.aim(found[0], mine, found[1], _way(act.goal))
                 x = act.x = arm.improve(act.x, tips, aim, 3)
         x = target + np.clip(x - target, -FAST, FAST)
         x = now + np.clip(x - now, -AHEAD, AHEAD)
-        free = Aim(None, aim.boxes, aim.margins)
-        return arm.improve(x, tips, free, 2)
+        return arm.improve(x, tips, Aim(None, aim.boxes, aim.margins), 2)
 
     # -- Way points ------------------------------------------------------------------
 
     def _way_point(
-        self, arm: Arm, hand: str, act: Act, view: View, now: Array
+        self, hand: str, act: Act, view: View, now: Array
     ) -> tuple[Array, float] | None:
         """Return where the tip goes, and how near the object; None: nowhere."""
-        tip = arm.hand(now, act.tips).tip
+        tip = self.arms[hand].hand(now, act.tips).tip
         if isinstance(act.goal, Push):
             return self._push(act, act.goal, view, tip)
         fingers = [f in self.env.agent.hands[hand] for f in self.env.agent.fingers]
-        return self._touch(act, view, tip, view.touched(fingers, act.index))
-
-    def _touch(
-        self, act: Act, view: View, tip: Array, touched: bool
-    ) -> tuple[Array, float] | None:
-        if touched:
+        if view.touched(fingers, act.index):
             return None
         place, top = view.place(act.index), view.top(act.index)
         if act.phase == 0 and np.linalg.norm((tip - place)[:2]) > NEAR:
@@ -439,7 +423,7 @@ class Scripted:
     def _push(
         self, act: Act, goal: Push, view: View, tip: Array
     ) -> tuple[Array, float] | None:
-        ahead = _way(goal)
+        ahead = np.array(DIRECTIONS[goal.direction])
         place, start = view.place(act.index), view.start(act.index)
         if (place - start) @ ahead >= goal.distance + 0.003:
             return None
@@ -470,50 +454,37 @@ class Scripted:
         for _ in range(view.stage):
             goal = goal.b if isinstance(goal, Then) else goal
         goals = acts_in(goal.a if isinstance(goal, Then) else goal)
-        hands = list(self.arms)
         rated = {
             (k, hand): self._rate(view, each, hand)
             for k, each in enumerate(goals)
-            for hand in hands
+            for hand in self.arms
             if getattr(each, "hand", None) in (None, hand)
         }
         ways = [
-            way
-            for way in itertools.permutations(hands, len(goals))
-            if all(pair in rated for pair in enumerate(way))
+            {hand: rated[k, hand] for k, hand in enumerate(way)}
+            for way in itertools.permutations(self.arms, len(goals))
+            if rated.keys() >= set(enumerate(way))
         ]
-        best = min(
-            ways, key=lambda way: sum(rated[pair].miss for pair in enumerate(way))
-        )
-        return {hand: rated[k, hand] for k, hand in enumerate(best)}
+        return min(ways, key=lambda way: sum(act.miss for act in way.values()))
 
     def _rate(self, view: View, goal: Touch | Push, hand: str) -> Act:
         """Return how a hand would do something: with the fingers that reach it best."""
-        arm, index = self.arms[hand], view.index(goal)
-        found: list[Act] = []
+        arm, found = self.arms[hand], list[Act]()
         for tips in arm.tips:
-            x, miss = self._try(view, goal, arm, index, tips)
-            found.append(Act(goal, index, tips, x, miss))
-            if miss < 0.004:
+            found.append(self._try(view, goal, arm, tips))
+            if found[-1].miss < 0.004:
                 break
         best = min(found, key=lambda act: act.miss)
-        best.miss += 0.05 * max(0.0, -arm.side * view.place(index)[1])  # the other side
+        y = view.place(best.index)[1]
+        best.miss += 0.05 * max(0.0, -arm.side * y)  # the other side
         return best
 
-    def _try(
-        self,
-        view: View,
-        goal: Touch | Push,
-        arm: Arm,
-        index: int,
-        tips: Tips,
-    ) -> tuple[Array, float]:
-        """Return numbers over the object, and how far all way points are missed [m]."""
+    def _try(self, view: View, goal: Touch | Push, arm: Arm, tips: Tips) -> Act:
+        """Return how it would be done with these fingers, from over the object on."""
+        index, push = view.index(goal), _way(goal)
         place, over = view.place(index), view.top(index) + OVER
-        push = None
         low = np.append(place[:2], over - OVER + 0.009)
-        if isinstance(goal, Push):
-            push = _way(goal)
+        if push is not None:
             low = np.append((place - BEHIND * push)[:2], LOW)
         aim = view.aim(low, [index], push=push)
         x = arm.search(tips, aim)
@@ -524,18 +495,19 @@ class Scripted:
         if isinstance(goal, Push):
             aim = self._at_end(view, goal, index)
             miss += arm.miss(arm.improve(x, tips, aim, 12), tips, aim)
-        return high, miss
+        return Act(goal, index, tips, high, miss)
 
     def _at_end(self, view: View, goal: Push, index: int) -> Aim:
         """Return the aim of a hand that has pushed something as far as it shall be."""
-        push, boxes = _way(goal), view.boxes.copy()
+        push, boxes = np.array(DIRECTIONS[goal.direction]), view.boxes.copy()
         boxes[index, :2] = (view.start(index) + goal.distance * push)[:2]
         tip = np.append((boxes[index, :3] - 0.027 * push)[:2], LOW)
         return Aim(tip, boxes, view.aim(tip, [index]).margins, push)
 
 
-def _way(goal: Push) -> Array:
-    return np.array(DIRECTIONS[goal.direction])
+def _way(goal: Touch | Push) -> Array | None:
+    """Return the direction [3] in which a goal pushes; None: it does not."""
+    return np.array(DIRECTIONS[goal.direction]) if isinstance(goal, Push) else None
 
 
 class View:
