@@ -375,21 +375,3 @@ def test_the_users_nao_acts_and_feels_like_ours(env: gym.Env) -> None:
     again, _ = env.reset(seed=0)  # builds the scene anew
     assert again["agent"]["proprioception"].isfinite().all()
     assert obs["sensor_data"]["front_camera"]["rgb"].float().std() > 10
-
-
-def test_a_class_may_name_the_file_instead(urdf: Path) -> None:
-    class MyNao(Nao):
-        uid = "my_nao"
-        urdf_path = str(urdf)
-
-    with gym.make(
-        "NaoTouchCubeSingle-v1",
-        robot_uids=MyNao,
-        obs_mode="state_dict",
-        render_backend="none",
-    ) as env:
-        env.reset(seed=0)
-        for _ in range(3):
-            obs = env.step(env.action_space.sample())[0]
-        assert obs["agent"]["proprioception"].isfinite().all()
-        assert env.unwrapped.agent.urdf_path == str(urdf)
