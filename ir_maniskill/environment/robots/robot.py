@@ -251,9 +251,6 @@ class Robot(BaseAgent, ABC):
 
         Args:
             action: As the control mode asks, in the order of `joints` [N, J].
-
-        Raises:
-            ValueError: It leads to NaN (checked on the CPU only).
         """
         self.controller.set_action(action)
 
