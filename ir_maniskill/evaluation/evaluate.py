@@ -54,11 +54,7 @@ class Rate:
     """Episodes played."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.count <= self.total or self.total < 1:
-            raise ValueError(
-                f"rate: got {self.count} of {self.total}, expected 0 <= count <= total "
-                "and at least one episode"
-            )
+        assert 0 <= self.count <= self.total and self.total > 0, self
 
     @property
     def value(self) -> float:

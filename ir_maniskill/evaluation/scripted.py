@@ -43,6 +43,8 @@ ACROSS = 0.3
 """Of fingers that are not side by side behind what they push."""
 DOWN = 0.86
 """How far down a hand is to point; level is 0."""
+SAMPLES = 6000
+"""Random postures of a hand that searches may start from."""
 
 # -- Sizes and way points --------------------------------------------------------------
 
@@ -96,14 +98,8 @@ class Aim:
 class Arm:
     """An arm and its hand: where it is by its numbers, and the numbers for an aim."""
 
-    def __init__(self, robot: Robot, hand: str, samples: int = 6000) -> None:
-        """Read the robot's kinematics, and try random postures to start searches from.
-
-        Args:
-            robot: One whose hand it is.
-            hand: Its name.
-            samples: How many postures.
-        """
+    def __init__(self, robot: Robot, hand: str) -> None:
+        """Read a hand's kinematics, and try random postures to start searches from."""
         self.scale, fingers = robot.scale, robot.hands[hand]
         articulation = robot.robot
         self._model = articulation._objs[0].create_pinocchio_model()
@@ -134,7 +130,7 @@ class Arm:
         """Which fingers may be what touches, the best first."""
         self.rest = np.zeros(len(moved))
         """All joints, of which those that are not the hand's stay so [J] [rad]."""
-        self._tables = {tips: self._table(tips, samples) for tips in self.tips}
+        self._tables = {tips: self._table(tips) for tips in self.tips}
 
     def numbers(self, joints: Array) -> Array:
         """Return the numbers of the hand, of all joints [J]: [X]."""
@@ -177,7 +173,7 @@ class Arm:
 
     # -- The numbers for an aim --------------------------------------------------------
 
-    def search(self, tips: Tips, aim: Aim, starts: int = 4) -> Array:
+    def search(self, tips: Tips, aim: Aim) -> Array:
         """Return numbers for an aim, from the best of the postures tried before."""
         hands, low = self._tables[tips][1:]
         assert aim.tip is not None
@@ -187,7 +183,7 @@ class Arm:
         for i in near:
             room = clearance(hands.balls[i], self._radii, aim.boxes)
             cost[i] += AT_TIP**2 * (np.minimum(room - aim.margins, 0) ** 2).sum()
-        best = near[np.argsort(cost[near])[:starts]]
+        best = near[np.argsort(cost[near])[:4]]
         found = [self.improve(self._tables[tips][0][i], tips, aim, 15) for i in best]
         residuals = [self._residual(x, tips, aim, x) for x in found]
         return found[np.argmin([r @ r for r in residuals])]
@@ -237,9 +233,9 @@ class Arm:
         level = _unit((tip - self.shoulder) * (1, 1, 0))
         return 0.5 * level - np.array([0, 0, DOWN])
 
-    def _table(self, tips: Tips, samples: int) -> tuple[Array, Hand, Array]:
+    def _table(self, tips: Tips) -> tuple[Array, Hand, Array]:
         """Return random numbers, the hands that they make, and what these cost."""
-        uniform = np.random.default_rng(0).uniform(size=(samples, len(self.joints) + 1))
+        uniform = np.random.default_rng(0).uniform(size=(SAMPLES, len(self.joints) + 1))
         low, high = self._low[self.joints], self._high[self.joints]
         numbers = uniform * np.append(high - low, 1) + np.append(low, 0)
         tried = zip(*(self.hand(x, tips) for x in numbers), strict=True)
