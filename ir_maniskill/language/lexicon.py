@@ -123,10 +123,8 @@ class Lexicon:
         return dict.fromkeys(get_close_matches(word, known, n=1, cutoff=ALIKE), 1.0)
 
 
-@cache
-def lexicon(vocabulary: tuple[str, ...]) -> Lexicon:
-    """Return the lexicon of a vocabulary, the same one for all who ask."""
-    return Lexicon(vocabulary)
+lexicon = cache(Lexicon)
+"""Returns the lexicon of a vocabulary, the same one for all who ask."""
 
 
 @cache
