@@ -1,4 +1,4 @@
-"""What a step costs, in counts: they don't depend on what else the machine does.
+"""What pictures cost, in counts: they don't depend on what else the machine does.
 
 A bound that breaks asks a question, it doesn't forbid: raise it if the work is worth
 it, and say so in docs/throughput.md.
