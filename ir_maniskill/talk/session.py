@@ -162,17 +162,16 @@ class Session:
             require_choice("task", choice.task, catalog.available())
             require_choice("robot", choice.robot, robots())
             players = self.players(choice)
-            if "policy" not in wanted:
-                best = RANDOM if self._random else players[0]
-                choice = replace(choice, policy=best)
-            require_choice("policy", choice.policy, players)
+            if "policy" in wanted:
+                require_choice("policy", choice.policy, players)
+                chance = choice.policy == RANDOM
+            else:
+                chance = self._random
+                choice = replace(choice, policy=RANDOM if chance else players[0])
             self._enter(choice)
+            self._random = chance
         except ValueError as error:
             self.note = str(error)
-        else:
-            self._random = (
-                choice.policy == RANDOM if "policy" in wanted else self._random
-            )
 
     def players(self, choice: Choice | None = None) -> list[str]:
         """Return the names of what can move the robot in the task, the best first."""
@@ -180,39 +179,34 @@ class Session:
         return fitting(choice.task, choice.robot, self._checkpoint)
 
     def _enter(self, choice: Choice) -> None:
-        self.env, self._policy = self._stage(choice)
-        self.choice = choice
-        self.new_scene()
-
-    def _stage(self, choice: Choice) -> tuple[Any, Policy | RandomMotion]:
-        """Return the env of a choice, which is made once, and what plays there."""
+        """Go to the env of a choice, which is made once."""
         policy = None if choice.policy == RANDOM else load(choice.policy)
         kwargs = (policy or RandomMotion).env_kwargs | {"robot_uids": choice.robot}
         key = f"{choice.task} {kwargs}"
         if key not in self._envs:
             # Without its wrappers: what is live has no time limit.
             self._envs[key] = gym.make(choice.task, num_envs=1, **kwargs).unwrapped
-        env = self._envs[key]
-        return env, policy or RandomMotion(len(env.agent.joints))
+        self.env = self._envs[key]
+        self._policy = policy or RandomMotion(len(self.env.agent.joints))
+        self.choice = choice
+        self.new_scene()
 
     # -- Scenes ------------------------------------------------------------------------
 
     def new_scene(self) -> None:
         """Lay the objects out anew, with one of the task's sentences."""
-        self.run = None
         self.seed += 1
         self._begin()
         self._say(self.env.get_language_instruction()[0])
 
     def reset(self) -> None:
         """Begin again in the same scene, with the same sentence."""
-        self.run = None
         heard = self.reading.heard
         self._begin()
         self._say(heard)
 
     def _begin(self) -> None:
-        self.note = ""
+        self.run, self.note = None, ""
         self.held: tuple[int, float, float] | None = None
         self.obs, _ = self.env.reset(seed=self.seed)
         self._policy.reset()
