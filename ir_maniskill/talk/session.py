@@ -33,8 +33,12 @@ from ir_maniskill.snapshot import Snapshot
 from ir_maniskill.talk.players import RANDOM, RandomMotion, fitting, load, shortened
 from ir_maniskill.talk.reading import Reading, clean, names, read
 
-PAPER = ("NaoTouchCubeSingle-v1", "NaoTouchCubeMulti-v1", "NaoTouchCubeTriangle-v1")
-"""The paper's experiments I to III."""
+PAPER = {
+    "I": "NaoTouchCubeSingle-v1",
+    "II": "NaoTouchCubeMulti-v1",
+    "III": "NaoTouchCubeTriangle-v1",
+}
+"""The paper's experiments."""
 APART = 1.25 * OBJECT_SIZE
 """How near an object may be dragged to another one, between centers [m]."""
 LASTS = 2
