@@ -116,8 +116,6 @@ class _Play:
     """Accept a policy that was trained for another task."""
     seed: int = EVALUATION_SEED
     """Seed of the first episode; episode e starts from seed + e."""
-    instruction: str | None = None
-    """Play this sentence only; None: all of the task's."""
 
     def policy_file(self) -> Path:
         """Return the file of the policy: the one given, or the shipped one."""
@@ -133,7 +131,7 @@ class _Play:
 
     def options(self, *more: str) -> dict[str, Any]:
         """Return the arguments that go to `api` as they are."""
-        names = ("any_task", "seed", "instruction", *more)
+        names = ("any_task", "seed", *more)
         return {name: getattr(self, name) for name in names}
 
 
@@ -141,6 +139,8 @@ class _Play:
 class Evaluate(_Play):
     """Evaluate a policy: success, exclusive success and touch, per instruction."""
 
+    instruction: str | None = None
+    """Play this sentence only; None: all of the task's."""
     episodes: int = 100
     """Episodes, spread evenly over the instructions."""
     num_envs: int = 8
@@ -158,7 +158,7 @@ class Evaluate(_Play):
         if self.json is not None:
             require_writable(self.json)
         task = catalog.get(self.env_id).id
-        more = ("episodes", "num_envs", "sim_backend", "render_backend")
+        more = ("instruction", "episodes", "num_envs", "sim_backend", "render_backend")
         report = api.evaluate(policy, task, **self.options(*more))
         print(report)
         if self.json is not None:
@@ -173,19 +173,11 @@ class Evaluate(_Play):
 
 
 @dataclasses.dataclass(frozen=True)
-class Audit:
+class Audit(_Play):
     """Ask whether a policy looks, reads, and copes with what is new to it."""
 
-    env_id: TaskId
-    """Task, e.g. NaoTouchCubeShuffled-v1; MODULE is imported first."""
-    checkpoint: Path | None = None
-    """Policy or checkpoint file; None: the one that ships with the package."""
     policy: str | None = None
     """MODULE:FUNCTION from what a vector env observes to actions, to audit instead."""
-    any_task: bool = False
-    """Accept a policy that was trained for another task."""
-    seed: int = EVALUATION_SEED
-    """Seed of the first episode; episode e starts from seed + e."""
     episodes: int = 200
     """Episodes of each row of the table."""
     num_envs: int = 8
@@ -200,9 +192,8 @@ class Audit:
         for path in (self.json, self.picture):
             if path is not None:
                 require_writable(path)
-        policy = _function(self.policy) if self.policy else self._file()
-        names = ("any_task", "seed", "episodes", "num_envs")
-        options = {name: getattr(self, name) for name in names}
+        policy = _function(self.policy) if self.policy else self.policy_file()
+        options = self.options("episodes", "num_envs")
         report = api.audit(policy, catalog.get(self.env_id).id, **options)
         print(report)
         if self.json is not None:
@@ -210,9 +201,6 @@ class Audit:
             write_report(self.json, report, policy=origin)
         if self.picture is not None:
             plots.bars(report, self.picture)
-
-    def _file(self) -> Path:
-        return _Play(self.env_id, self.checkpoint).policy_file()
 
 
 def _function(name: str) -> Any:
@@ -231,6 +219,8 @@ def _function(name: str) -> Any:
 class Video(_Play):
     """Make a video of a policy (.mp4, or .gif)."""
 
+    instruction: str | None = None
+    """Play this sentence only; None: all of the task's."""
     out: Path | None = None
     """File to write; None: runs/ID.mp4."""
     episodes: int = 3
@@ -242,7 +232,7 @@ class Video(_Play):
         """Film the policy."""
         task = catalog.get(self.env_id).id
         out = self.out or Path("runs") / f"{task}.mp4"
-        options = self.options("episodes", "speed")
+        options = self.options("instruction", "episodes", "speed")
         api.record(self.policy_file(), out, task, **options)
         print(f"The video is in {out}.")
 

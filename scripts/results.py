@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
@@ -24,7 +23,6 @@ from ir_maniskill.training.run_folder import whole_rows
 ROOT = Path(__file__).parent.parent
 PAGE = ROOT / "docs" / "results.md"
 RUNS = ROOT / "docs" / "results" / "runs"
-CONTROLS = ROOT / "docs" / "results" / "controls.json"
 POLICIES = ROOT / "assets" / "policies"
 
 LAYOUTS = ("Single", "Multi", "Triangle", "Shuffled")
@@ -41,29 +39,10 @@ LEVEL = 0.95
 """Share of episodes from which a task counts as learned."""
 
 
-@dataclass(frozen=True)
-class Run:
-    """What is kept of a training run."""
-
-    name: str
-    """Name of its folder."""
-    task: str
-    """The task it learned."""
-    label: str
-    """How it learned, as the legend says it; runs with one label differ by seed."""
-    seed: int
-    """Its seed."""
-    steps: int
-    """Environment steps made."""
-    minutes: float
-    """Time spent collecting and learning, evaluations left out [min]."""
-    evaluations: list[dict[str, float]]
-    """`steps` and `COLUMNS` of each evaluation."""
-
-    def steps_to(self, column: str, level: float) -> str:
-        """Return after how many steps an evaluation first reached a level."""
-        reached = (row["steps"] for row in self.evaluations if row[column] >= level)
-        return next((_thousands(steps) for steps in reached), "never")
+Run = dict[str, Any]
+"""What is kept of a training: the `name` of its folder, its `task` and `seed`, how it
+learned as the legend says it (`label`; runs with one label differ by seed), its `steps`
+and `minutes`, evaluations left out, and the `evaluations`' steps and `COLUMNS`."""
 
 
 # -- Runs ----------------------------------------------------------------------------
@@ -74,38 +53,38 @@ def take_in(folder: Path, label: str) -> Run:
     config = json.loads((folder / "config.json").read_text())
     updates = whole_rows(folder / "metrics.csv")
     seconds = sum(float(r["time/collect"]) + float(r["time/update"]) for r in updates)
-    return Run(
-        name=folder.resolve().name,
-        task=config["env_id"],
-        label=label,
-        seed=config["seed"],
-        steps=int(updates[-1]["steps"]),
-        minutes=round(seconds / 60, 1),
-        evaluations=[
+    return {
+        "name": folder.resolve().name,
+        "task": config["env_id"],
+        "label": label,
+        "seed": config["seed"],
+        "steps": int(updates[-1]["steps"]),
+        "minutes": round(seconds / 60, 1),
+        "evaluations": [
             {"steps": int(row["steps"])} | {c: round(float(row[c]), 4) for c in COLUMNS}
             for row in whole_rows(folder / "evaluations.csv")
         ],
-    )
+    }
 
 
 def keep(run: Run, folder: Path = RUNS) -> None:
     """Write a run beside the others, one evaluation a line."""
-    text = json.dumps(asdict(run)).replace('{"steps"', '\n {"steps"')
-    (folder / f"{run.name}.json").write_text(text + "\n")
+    text = json.dumps(run).replace('{"steps"', '\n {"steps"')
+    (folder / f"{run['name']}.json").write_text(text + "\n")
 
 
 def kept(folder: Path = RUNS) -> list[Run]:
     """Return all runs that were taken in, by task, label and seed."""
-    runs = [Run(**json.loads(path.read_text())) for path in folder.glob("*.json")]
-    return sorted(runs, key=lambda run: (TASKS.index(run.task), run.label, run.seed))
+    runs = [json.loads(path.read_text()) for path in folder.glob("*.json")]
+    return sorted(runs, key=lambda r: (TASKS.index(r["task"]), r["label"], r["seed"]))
 
 
 def draw(runs: Sequence[Run], folder: Path) -> None:
     """Draw one picture for each task, with one curve for each label."""
-    for task, of_task in groupby(runs, lambda run: run.task):
+    for task, of_task in groupby(runs, itemgetter("task")):
         curves = [
-            Curve(label, [run.evaluations for run in same])
-            for label, same in groupby(of_task, lambda run: run.label)
+            Curve(label, [run["evaluations"] for run in same])
+            for label, same in groupby(of_task, itemgetter("label"))
         ]
         compare(curves, folder / f"{task}.png", title=task, level=PAPER.get(task))
 
@@ -121,7 +100,7 @@ def table(head: str, rows: Iterable[Sequence[str]]) -> str:
 
 def policies_table(policies: Mapping[str, Any], runs: Iterable[Run]) -> str:
     """Return a row for each shipped policy, with its figures' worst over sentences."""
-    by_name = {run.name: run for run in runs}
+    by_name = {run["name"]: run for run in runs}
     rows = []
     for task, figures in policies.items():
         scores, run = figures["instructions"].values(), by_name[figures["run"]]
@@ -129,7 +108,7 @@ def policies_table(policies: Mapping[str, Any], runs: Iterable[Run]) -> str:
         fingers = min(score["right_fingers"] for score in scores)
         same = figures.get("same_scene")
         shares.append(_share(same, "exclusive") if same else "")
-        effort = _thousands(run.steps), f"{run.minutes:.0f}"
+        effort = _thousands(run["steps"]), f"{run['minutes']:.0f}"
         rows.append((f"`{task}`", *shares, f"{fingers:.1f}", *effort))
     head = "task | success | exclusive | same scene | fingers | steps | minutes"
     return table(head, rows)
@@ -142,41 +121,33 @@ def sentences_table(policies: Mapping[str, Any]) -> str:
         for sentence, score in figures["instructions"].items():
             shares = [_share(score, name) for name in RATES]
             held = f"{score['holding']:.0%}", f"{score['right_fingers']:.1f}"
-            rows.append((f"`{task}`", _named(sentence), *shares, *held))
+            color = sentence.split()[-2]  # of "Touch the blue cube."
+            rows.append((f"`{task}`", color, *shares, *held))
     head = "task | named | success | exclusive | in touch | fingers"
     return table(head, rows)
-
-
-def controls_table(controls: Mapping[str, Any]) -> str:
-    """Return what each policy reaches when something is taken from it."""
-    tasks = {task: controls[task]["controls"] for task in TASKS if task in controls}
-    rows = []
-    for name in next(iter(tasks.values())):
-        scores = [by_name[name] for by_name in tasks.values()]
-        rows.append((name, *(" / ".join(f"{s[r]:.0%}" for r in RATES) for s in scores)))
-    return table(" | ".join(["taken away", *(f"`{task}`" for task in tasks)]), rows)
 
 
 def paper_table(runs: Iterable[Run]) -> str:
     """Return after how many steps each run of experiment I had learned it."""
     rows = []
-    for run in (run for run in runs if run.task == TASKS[0]):
-        reached = [run.steps_to(f"eval/{name}", LEVEL) for name in RATES]
-        fingers = max(row["eval/right_fingers"] for row in run.evaluations)
-        effort = f"{fingers:.1f}", _thousands(run.steps)
-        rows.append((run.label, str(run.seed), *reached, *effort))
+    for run in (run for run in runs if run["task"] == TASKS[0]):
+        reached = [steps_to(run, f"eval/{name}", LEVEL) for name in RATES]
+        fingers = max(row["eval/right_fingers"] for row in run["evaluations"])
+        effort = f"{fingers:.1f}", _thousands(run["steps"])
+        rows.append((run["label"], str(run["seed"]), *reached, *effort))
     head = "learned with | seed | success after | exclusive after | most fingers | of"
     return table(head, rows)
+
+
+def steps_to(run: Run, column: str, level: float) -> str:
+    """Return after how many steps an evaluation first reached a level."""
+    reached = (r["steps"] for r in run["evaluations"] if r[column] >= level)
+    return next((_thousands(steps) for steps in reached), "never")
 
 
 def _share(score: Mapping[str, Any], name: str) -> str:
     low, high = (100 * bound for bound in score[f"{name}_interval"])
     return f"{100 * score[name]:.1f}% [{low:.1f}, {high:.1f}]"
-
-
-def _named(sentence: str) -> str:
-    """Return the color in "Touch the blue cube."."""
-    return sentence.split()[-2]
 
 
 def _thousands(steps: float) -> str:
@@ -192,7 +163,6 @@ def tables() -> dict[str, str]:
     return {
         "policies": policies_table(policies, kept()),
         "sentences": sentences_table(policies),
-        "controls": controls_table(json.loads(CONTROLS.read_text())),
         "paper": paper_table(kept()),
     }
 

@@ -1,5 +1,4 @@
 import dataclasses
-import io
 import json
 import math
 import os
@@ -14,7 +13,6 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
-from PIL import Image
 from toy_envs import SPEC, ToyVectorEnv, toy_config, toy_state
 
 from ir_maniskill import experiment as catalog
@@ -90,13 +88,6 @@ def test_what_is_counted_keeps_all_its_bits(tmp_path):
     checkpoint.save_policy(tmp_path / "p", agent, config, steps=1, evaluation={})
     loaded, *_ = checkpoint.load_agent(tmp_path / "p")
     assert torch.equal(loaded.encoder.standardize.variance, torch.full((7,), 1e-6))
-
-
-def test_a_policy_file_is_smaller_than_a_checkpoint(trained, tmp_path):
-    small, large = write_both(tmp_path, *trained)
-    assert small.stat().st_size < large.stat().st_size / 6
-    agent_of_checkpoint, _, _ = checkpoint.load_agent(large)
-    assert agent_of_checkpoint.act(toy_state()).value.shape == (3,)
 
 
 def test_a_crash_while_writing_leaves_the_old_file(trained, tmp_path, monkeypatch):
@@ -194,21 +185,12 @@ def test_files_of_wrong_values_work_or_get_the_error(trained, tmp_path):
     assert after - before < 300_000, "sizes were believed before they were checked [KB]"
 
 
-def png():
-    buffer = io.BytesIO()
-    Image.new("RGB", (8, 8)).save(buffer, "png")
-    return buffer.getvalue()
-
-
 @pytest.mark.parametrize(
     "data",
     [
         b"",
-        b"PK\x03\x04 a zip",
-        b"\xff" * 64,
         b"\x02" + b"\0" * 7,
         pickle.dumps({"agent": 1}),
-        png(),
         safetensors.torch.save({"weight": torch.zeros(2)}),
         safetensors.torch.save({"weight": torch.zeros(2)}, {"kind": "another"}),
     ],
@@ -340,11 +322,6 @@ def test_a_policy_file_tells_task_words_robot_and_longest_sentence(task):
     assert facts["version"].count(".") >= 2
 
 
-def test_a_policy_meets_what_it_was_trained_for(task):
-    policy_for(task).require_match(task)
-    policy_for(task).require_match(task, "nao")
-
-
 def swapped(words):
     """Return a vocabulary with two words in each other's place."""
     return (*words[:5], words[6], words[5], *words[7:])
@@ -356,10 +333,6 @@ def swapped(words):
         (
             lambda task: {"vocabulary": swapped(task.vocabulary)},
             r"vocabulary\[5\]: got 'blue', expected 'red'$",
-        ),
-        (
-            lambda task: {"vocabulary": (*task.vocabulary, "push")},
-            r"vocabulary: got .*'button'\), expected .*'push'\)$",
         ),
         (
             lambda task: {"shuffled": True},
@@ -386,6 +359,7 @@ def test_another_task_or_robot_is_refused(task):
     with pytest.raises(MismatchError, match="not fit NaoTouchCubeShuffled-v1: task"):
         policy_for(task).require_match(other)
     policy_for(task).require_match(other, any_task=True)
+    policy_for(task).require_match(task, "nao")
     words = dataclasses.replace(other, vocabulary=swapped(other.vocabulary))
     with pytest.raises(MismatchError, match=r"vocabulary\[5\]"):
         policy_for(task).require_match(words, any_task=True)

@@ -5,11 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
-from ir_maniskill.environment.contacts import (
-    CpuTouchSensor,
-    GpuTouchSensor,
-    touch_sensor,
-)
+from ir_maniskill.environment.contacts import CpuTouchSensor, GpuTouchSensor
 
 TIMESTEP = 0.01
 
@@ -34,10 +30,9 @@ def test_cpu_sensor_adds_up_a_fingers_links_and_keeps_each_substeps_touches() ->
         touch("thumb", "blue", (0, 0, 0.00009)),  # 0.009 N: too light
     ]
     system = SimpleNamespace(get_contacts=lambda: contacts, timestep=TIMESTEP)
-    scene = SimpleNamespace(px=system, gpu_sim_enabled=False)
+    scene = SimpleNamespace(px=system)
     fingers = [[part("base"), part("tip")], [part("thumb")]]
-    sensor = touch_sensor(scene, fingers, [part("blue"), part("red")])
-    assert isinstance(sensor, CpuTouchSensor)
+    sensor = CpuTouchSensor(scene, fingers, [part("blue"), part("red")])
     sensor.update()
     assert sensor.read().tolist() == [[[False, True], [False, False]]]
     contacts[:] = [touch("thumb", "blue", (0, 0, 0.002))]
@@ -68,11 +63,10 @@ class GpuSystem:
 
 def test_gpu_sensor_puts_every_pair_where_it_belongs() -> None:
     system = GpuSystem()
-    scene = SimpleNamespace(px=system, gpu_sim_enabled=True, num_envs=2, device="cpu")
+    scene = SimpleNamespace(px=system, num_envs=2, device="cpu")
     fingers = [[part("a0", "a1"), part("b0", "b1")], [part("c0", "c1")]]
     objects = [part("x0", "x1"), part("y0", "y1")]
-    sensor = touch_sensor(scene, fingers, objects)
-    assert isinstance(sensor, GpuTouchSensor)
+    sensor = GpuTouchSensor(scene, fingers, objects)
     for k, (link, thing) in enumerate(system.pairs):
         system.chosen = (k,)
         sensor.clear()

@@ -40,13 +40,6 @@ def demonstrate(folder: Path) -> list[Any]:
     return [cli.parse(line.split()) for line in lines]
 
 
-def test_a_finished_training_is_not_made_again(folder: Path) -> None:
-    first, *rest = demonstrate(folder)
-    assert [type(command) for command in rest] == [cli.Evaluate, cli.Video, cli.Curve]
-    assert type(first) is cli.Train
-    assert demonstrate(folder) == rest
-
-
 def test_an_interrupted_training_goes_on(folder: Path) -> None:
     (folder / "best.safetensors").touch()
     training, *_ = demonstrate(folder)
@@ -56,7 +49,9 @@ def test_an_interrupted_training_goes_on(folder: Path) -> None:
 def test_the_demonstration_trains_from_pictures_and_leaves_figures_and_a_film(
     folder: Path,
 ) -> None:
-    training, evaluation, video, curve = demonstrate(folder)
+    training, *rest = demonstrate(folder)
+    evaluation, video, curve = rest
+    assert demonstrate(folder) == rest  # a finished training is not made again
     assert training.config.agent.senses == ("vision",)
     assert evaluation.episodes == 12
     best = folder / "best.safetensors"
@@ -64,3 +59,5 @@ def test_the_demonstration_trains_from_pictures_and_leaves_figures_and_a_film(
     left = (evaluation.json, video.out, curve.out)
     names = ("report.json", "video.mp4", "learning_curve.png")
     assert left == tuple(folder / name for name in names)
+    kinds = [cli.Train, cli.Evaluate, cli.Video, cli.Curve]
+    assert [type(command) for command in (training, *rest)] == kinds

@@ -6,9 +6,7 @@ import re
 import runpy
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -16,7 +14,6 @@ from ir_maniskill import available
 from ir_maniskill.training.config import CONFIGS
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-MULTI = replace(CONFIGS["default"], env_id="NaoTouchCubeMulti-v1")
 TINY = """
 import runpy, sys
 from dataclasses import replace
@@ -110,25 +107,6 @@ def test_stable_baselines3_trains(tmp_path: Path) -> None:
     assert re.search(r"total_timesteps +\| 256 ", out)
     assert re.search(r"\d of 1 episodes touched", out)
     assert (tmp_path / "runs" / "sb3_ppo.zip").stat().st_size > 1000
-
-
-def test_a_checkpoint_is_played_on_the_task_that_is_named(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    main = runpy.run_path(script("evaluate_and_record.py"))["main"]
-    played = []
-    fakes = {"load_agent": lambda path: (SimpleNamespace(policy=None), MULTI, {})}
-    fakes["make_vec"] = lambda task, *_, **__: SimpleNamespace(
-        task=task, close=lambda: None
-    )
-    fakes["evaluate_policy"] = lambda policy, envs, **_: played.append(envs.task)
-    for name in ("write_report", "record", "write_video"):
-        fakes[name] = lambda *_, **__: None
-    for name, fake in fakes.items():
-        monkeypatch.setitem(main.__globals__, name, fake)
-    main(Path("a.safetensors"), task="NaoTouchCubeTriangle-v1", out=tmp_path)
-    main(Path("a.safetensors"), out=tmp_path)
-    assert played == ["NaoTouchCubeTriangle-v1", MULTI.env_id]
 
 
 @pytest.mark.render

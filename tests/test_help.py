@@ -9,7 +9,6 @@ import pytest
 
 import ir_maniskill_cli
 from ir_maniskill import cli
-from ir_maniskill.training.config import CONFIGS, AgentConfig
 
 TASK = "NaoTouchCubeSingle-v1"
 
@@ -44,12 +43,6 @@ def test_the_help_of_train_is_short_and_true():
     for option in options:
         value = [] if option == "--resume" else [values.get(option, "3")]
         cli.parse(["train", TASK, option, *value, "--out", "/nowhere"])
-
-
-def test_the_help_of_train_names_all_there_is_to_choose_from():
-    words = set(re.findall(r"\w+", ir_maniskill_cli.TRAIN))
-    senses = {*AgentConfig().senses, "state"}
-    assert {*CONFIGS, *senses, "nao", "g1", "panda"} <= words
 
 
 @pytest.mark.parametrize(
@@ -89,8 +82,8 @@ def ascii_stream() -> io.TextIOWrapper:
     return io.TextIOWrapper(io.BytesIO(), encoding="ascii")
 
 
-@pytest.mark.parametrize("text", ["Berühre den Würfel.", "• 触摸"])
-def test_a_terminal_that_knows_ascii_alone_is_told_all(text, monkeypatch):
+def test_a_terminal_that_knows_ascii_alone_is_told_all(monkeypatch):
+    text = "Würfel • 触摸"
     out, errors = ascii_stream(), ascii_stream()
     monkeypatch.setattr(sys, "stdout", out)
     monkeypatch.setattr(sys, "stderr", errors)

@@ -18,10 +18,6 @@ from ir_maniskill.language.tokens import PAD, UNK, VOCABULARY, split_words, toke
 CPU = torch.device("cpu")
 
 
-def test_the_vocabulary_has_the_papers_size() -> None:
-    assert len(VOCABULARY) == len(set(VOCABULARY)) == 10
-
-
 def test_the_papers_sentence_has_five_tokens() -> None:
     assert tokenize("Touch the blue cube.") == [3, 4, 5, 8, 2]
 
@@ -85,11 +81,6 @@ def test_uniform_numbers_pick_every_instruction_equally() -> None:
     instructions = InstructionalSet(catalog.get("NaoTouchCubeMulti-v1"), HANDS, CPU)
     picks = instructions.pick(torch.tensor([0.0, 0.33, 0.34, 0.66, 0.67, 1.0]))
     assert picks.tolist() == [0, 0, 1, 1, 2, 2]
-
-
-@given(st.text(), st.text())
-def test_sentences_are_read_word_by_word(first: str, second: str) -> None:
-    assert tokenize(f"{first} {second}") == tokenize(first) + tokenize(second)
 
 
 @given(st.lists(st.floats(0, 1, width=32), min_size=1))

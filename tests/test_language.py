@@ -1,11 +1,8 @@
 """The instruction language: what is said, true of a scene, and held out of training."""
 
-import json
-from importlib import resources
 from random import Random
 
 import pytest
-import torch
 
 from ir_maniskill.goals import (
     COLORS,
@@ -25,25 +22,18 @@ from ir_maniskill.goals import (
     other_than,
 )
 from ir_maniskill.language import (
-    HELD_OBJECTS,
-    HELD_PAIRS,
     KINDS,
-    SPLITS,
     SentenceError,
     Thing,
-    count,
-    counts,
     draw,
     handwritten,
     parse,
     say,
     split_of,
-    things,
     words,
 )
 from ir_maniskill.language.grammar import RULES
 from ir_maniskill.language.tokens import split_words
-from ir_maniskill.snapshot import Snapshot
 
 RED, BLUE = Ref("red"), Ref("blue", "cube")
 SCENE = (
@@ -92,27 +82,6 @@ def any_scene(rng):
     )
 
 
-def snapshot(scenes):
-    """Return scenes as a snapshot, each with an empty place before its objects."""
-    count = 1 + max(map(len, scenes))
-    color = torch.full((len(scenes), count), -1)
-    shape = torch.zeros_like(color)
-    start = torch.zeros(len(scenes), count, 7)
-    for n, scene in enumerate(scenes):
-        for c, thing in enumerate(scene, 1):
-            color[n, c] = [*COLORS].index(thing.color)
-            shape[n, c] = SHAPES.index(thing.shape)
-            start[n, c, :2] = torch.tensor([thing.x, thing.y])
-    rest = dict.fromkeys(("contact", "fingertip", "pose", "velocity", "stage"))
-    return Snapshot(**rest, color=color, shape=shape, start=start)
-
-
-def all_refs(goal):
-    """Return all references in a goal, also those in relations."""
-    inner = [ref.where.ref for ref in goal.refs if isinstance(ref.where, Relation)]
-    return [*goal.refs, *inner]
-
-
 def drawn(amount, split, seed=0, kinds=KINDS):
     """Yield scenes and goals that are true of them."""
     rng = Random(seed)
@@ -123,40 +92,6 @@ def drawn(amount, split, seed=0, kinds=KINDS):
         except GoalError:  # nothing to say of this one
             continue
         amount -= 1
-
-
-def meant(goal, scene):
-    """Return the objects that a goal means, each with what is done to it."""
-    found = []
-    for part in goal.parts or (goal,):
-        verb = "leave"
-        if isinstance(part, Push):
-            verb = f"push {part.direction}"
-        elif isinstance(part, Touch):
-            verb = f"{part.hand} hand" if part.hand else "touch"
-        found.append((verb, fitting(part.ref, scene)))
-        if isinstance(part.ref.where, Relation):
-            found.append(("find", fitting(part.ref.where.ref, scene)))
-    return found
-
-
-def fitting(ref, scene):
-    """Return the one object that a reference fits, found the slow way."""
-    color, shape, where = ref.color, ref.shape, ref.where
-    fits = [t for t in scene if color in (None, t.color) and shape in (None, t.shape)]
-    if isinstance(where, str):
-        axis, sign = EXTREMES[where]
-        fits = [max(fits, key=lambda t: sign * t[2 + axis])]
-    elif where:
-        other = fitting(where.ref, scene)
-        side = {
-            "left_of": lambda t: t.y > other.y,
-            "right_of": lambda t: t.y < other.y,
-            "other_than": lambda t: t is not other,
-        }
-        fits = list(filter(side[where.kind], fits))
-    (one,) = fits
-    return one
 
 
 # -- Saying and reading --------------------------------------------------------------
@@ -222,36 +157,7 @@ def test_a_goal_without_words_is_refused(goal):
         say(goal, Random(0))
 
 
-def test_all_sentences_of_a_goal_are_said_and_counted():
-    rng = Random(0)
-    goal = Touch(Ref(shape="cube"))
-    # 1 + 4 + 2 + 1 + 2 kinds of politeness, 4 + 1 + 4 verbs, "cube" and "block".
-    assert count(goal) == 10 * 9 * 2
-    said = {say(goal, rng) for _ in range(10_000)}
-    assert 0.9 * count(goal) < len(said) <= count(goal)
-
-
-def test_all_colors_shapes_and_directions_have_words():
-    rng = Random(0)
-    for color in COLORS:
-        for shape in SHAPES:
-            for direction in DIRECTIONS:
-                say(Push(Ref(color, shape), direction), rng)
-
-
 # -- Drawing -------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("split", ["train", "objects", "pairs"])
-def test_every_reference_of_a_drawn_goal_fits_one_object(split):
-    scenes, goals = zip(*drawn(200, split), strict=True)
-    rows = snapshot(scenes)
-    assert things(rows)[0] == tuple(
-        t._replace(x=pytest.approx(t.x), y=pytest.approx(t.y)) for t in scenes[0]
-    )
-    for ref in {ref for goal in goals for ref in all_refs(goal)}:
-        asked = torch.tensor([ref in all_refs(goal) for goal in goals])
-        assert (ref.resolve(rows).sum(dim=1)[asked] == 1).all(), ref
 
 
 def test_drawn_goals_are_of_the_kind_asked_and_can_be_done():
@@ -290,14 +196,6 @@ def test_relations_are_clear_to_see():
     assert {getattr(where, "kind", where) for where in wheres} == {"other_than"}
 
 
-def test_the_same_seed_draws_the_same():
-    def once():
-        rng = Random(5)
-        return [say(draw(SCENE, KINDS, rng), rng) for _ in range(50)]
-
-    assert once() == once()
-
-
 @pytest.mark.parametrize(
     ("kinds", "split", "message"),
     [
@@ -321,17 +219,12 @@ def of_training(sentence):
         return False
 
 
-def test_training_never_means_what_is_held_out():
+def test_training_says_nothing_that_is_held_out():
     rng, known = Random(0), set(words())
-    for number, (scene, goal) in enumerate(drawn(20_000, "train", 3)):
-        acts = meant(goal, scene)
-        assert split_of(goal) == "train"
-        assert not {thing[:2] for _, thing in acts} & HELD_OBJECTS
-        assert not {(verb, thing.color) for verb, thing in acts} & HELD_PAIRS
-        if number % 10 == 0:
-            text = say(goal, rng)
-            assert of_training(text)
-            assert set(split_words(text)) <= known
+    for _, goal in drawn(2_000, "train", 3):
+        text = say(goal, rng)
+        assert split_of(goal) == "train" and of_training(text)
+        assert set(split_words(text)) <= known
 
 
 @pytest.mark.parametrize("split", ["objects", "pairs"])
@@ -340,12 +233,6 @@ def test_goals_of_a_split_say_what_training_never_says(split):
     for _, goal in drawn(1_000, split, 4):
         assert split_of(goal) == split
         assert not of_training(say(goal, rng))
-
-
-def test_each_kind_can_be_drawn_in_each_split():
-    for split in SPLITS:
-        for kind in KINDS:
-            assert next(drawn(1, split, kinds=[kind]))
 
 
 def test_held_out_wording_is_never_said_in_training():
@@ -377,24 +264,3 @@ def test_held_out_words_are_new():
     assert len(words()) >= 40
     assert not {"crimson", "shove", "poke", "simultaneously"} & set(words())
     assert set(words()) < set(words("wording"))
-    missing = {"can", "pyramid"} - set(SHAPES)
-    assert not missing & set(words())
-
-
-def test_counts_of_splits():
-    kinds = ("touch", "push")
-    train, new = counts("train", kinds), counts("objects", kinds)
-    held = [thing for thing in HELD_OBJECTS if thing[1] in SHAPES]
-    # All names, but not those held out, nor those that say "orange".
-    names = len(COLORS) * len(SHAPES) + len(COLORS) + len(SHAPES)
-    orange, both = len(SHAPES) + 1, sum(color == "orange" for color, _ in held)
-    assert train["touch"][0] == names - len(held) - orange + both
-    assert new["touch"][0] == len(held) - both
-    assert all(sentences > 4_000 for _, sentences in train.values())
-    assert counts("places", kinds) == train
-
-
-def test_the_tables_are_ready_for_more_shapes():
-    path = resources.files("ir_maniskill.language") / "grammar.json"
-    shapes = json.loads(path.read_text())["words"]["shape"]
-    assert {"cube", "button", "can", "pyramid"} <= shapes.keys()

@@ -182,33 +182,16 @@ def test_meshes_are_found_in_ros_packages(
     assert names == {str(folder / "phalanx.dae"), str(folder / "phalanx.stl")}
 
 
-def test_missing_meshes_are_named_once_with_where_they_were_sought(
-    urdf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "nao_meshes" / "meshes" / "phalanx.stl").unlink()
-    monkeypatch.setenv("ROS_PACKAGE_PATH", "/opt/packages")
-    with pytest.raises(RobotError) as error:
-        adapt(urdf, str(URDF_PATH))
-    message = str(error.value)
-    assert message.count(f"{MESHES}/phalanx.stl") == 1
-    assert "phalanx.dae" not in message
-    assert "ROS_PACKAGE_PATH=/opt/packages" in message
-    assert str(urdf) in message and str(urdf.parent) in message
-
-
 @pytest.mark.parametrize(
     "start",
     [
         "file://localhost{folder}/",
-        "file://{folder}/",
         "model://nao_meshes/meshes/",
-        "{folder}/more%20meshes/../",
         "package://nao_meshes/more%20meshes/",
     ],
 )
 def test_meshes_are_found_by_urls(urdf: Path, tmp_path: Path, start: str) -> None:
     folder = tmp_path / "nao_meshes" / "meshes"
-    (folder / "more meshes").mkdir()
     (tmp_path / "nao_meshes" / "more meshes").symlink_to(folder)
     edited(urdf, f"{MESHES}/", start.format(folder=folder))
     theirs = ET.fromstring(adapt(urdf, str(URDF_PATH)))
@@ -216,17 +199,20 @@ def test_meshes_are_found_by_urls(urdf: Path, tmp_path: Path, start: str) -> Non
     assert all(name.samefile(folder / name.name) for name in names)
 
 
-@pytest.mark.parametrize("missing", [("texture",), ("mesh", "texture")])
-def test_a_missing_texture_is_called_one(
-    urdf: Path, tmp_path: Path, missing: tuple[str, ...]
+def test_missing_files_are_named_once_with_where_they_were_sought(
+    urdf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    (tmp_path / "nao_meshes" / "meshes" / "phalanx.stl").unlink()
     paint = '<material name="paint"><texture filename="paint.png"/></material><link '
     urdf.write_text(urdf.read_text().replace("<link ", paint, 1))
-    if "mesh" in missing:
-        (tmp_path / "nao_meshes" / "meshes" / "phalanx.stl").unlink()
-    with pytest.raises(RobotError, match=r"missing textures: paint\.png;") as error:
+    monkeypatch.setenv("ROS_PACKAGE_PATH", "/opt/packages")
+    with pytest.raises(RobotError) as error:
         adapt(urdf, str(URDF_PATH))
-    assert ("missing meshes" in str(error.value)) == ("mesh" in missing)
+    message = str(error.value)
+    assert message.count(f"missing meshes: {MESHES}/phalanx.stl;") == 1
+    assert "missing textures: paint.png;" in message and "phalanx.dae" not in message
+    assert "ROS_PACKAGE_PATH=/opt/packages" in message
+    assert str(urdf) in message and str(urdf.parent) in message
 
 
 # -- What else may be missing ----------------------------------------------------------
@@ -245,9 +231,7 @@ def test_a_missing_texture_is_called_one(
         ),
         ('<child link="RForeArm" />', "", "RElbowRoll.*missing <child>"),
         ('rpy="1.8862 0.976662 0.264067"', 'rpy="1 2"', "expected three numbers"),
-        ('value="1.04956"', 'value="heavy"', "heavy"),
         ('value="1.04956"', 'value="nan"', "torso.*got 'nan', expected a finite"),
-        ('rpy="1.8862 0.976662 0.264067"', 'rpy="1 2 inf"', "expected three numbers"),
         ('<link name="torso">', "<link>", "a <link> has no name"),
         ('upper="2.08567"', 'upper="-3"', "'LShoulderPitch'.*upper=\"-3\".*lower < up"),
         ("<robot ", "<sdf", "not XML"),
@@ -281,16 +265,11 @@ VISUAL = "link[@name='RThumb2_link']/visual/geometry"
         ("joint[@name='HeadPitch']", {"name": "HeadYaw"}, "joint 'HeadYaw': got two"),
         ("link[@name='Head']", {"name": "Neck"}, "link 'Neck': got two"),
         ("joint[@name='LElbowYaw']/axis", {"xyz": "0 0 0"}, "'LElbowYaw': <axis>"),
-        ("joint[@name='RThumb1']/axis", {"xyz": "0 0 -0"}, "'RThumb1': <axis>"),
         ("joint[@name='LElbowYaw']/limit", {"effort": "0"}, "'LElbowYaw'.*effort=.0"),
-        ("joint[@name='RWristYaw']/limit", {"velocity": "-1"}, "'RWristYaw'.*velocity"),
         ("link[@name='LBicep']/inertial/inertia", ZEROS, "'LBicep': <inertial>.*0 0 0"),
-        ("link[@name='torso']/inertial/inertia", {"iyy": "-1"}, "'torso': <inertial>"),
         ("link[@name='torso']/inertial/mass", {"value": "-1"}, "'torso': <inertial>"),
         (f"{COLLISION}/mesh", {"scale": "0.1"}, "'LFinger11_link': <mesh> scale"),
-        (f"{VISUAL}/mesh", {"scale": "a b c"}, "'RThumb2_link': <mesh> scale.*'a b c'"),
         (f"{COLLISION}/mesh", {"scale": "0.1 -0.1 0.1"}, "'LFinger11_link'.*mirror"),
-        (f"{VISUAL}/mesh", {"scale": "-1 1 1"}, "'RThumb2_link'.*-1 1 1.*mirror"),
         (f"{VISUAL}/mesh", {"filename": ""}, "'RThumb2_link': <mesh>.*'filename'"),
     ],
 )
@@ -310,9 +289,8 @@ def test_a_geometry_without_a_size_is_named(urdf: Path, shape: str) -> None:
         adapt(urdf, str(URDF_PATH))
 
 
-@pytest.mark.parametrize("before", ["\n  ", "\ufeff", "\ufeff \n"])
-def test_a_declaration_need_not_come_first(urdf: Path, before: str) -> None:
-    declared = f'{before}<?xml version="1.0" encoding="utf-8"?>{urdf.read_text()}'
+def test_a_declaration_need_not_come_first(urdf: Path) -> None:
+    declared = f'\ufeff \n<?xml version="1.0" encoding="utf-8"?>{urdf.read_text()}'
     urdf.write_text(declared, encoding="utf-8")
     assert adapt(urdf, str(URDF_PATH)).startswith("<robot")
 
@@ -327,8 +305,8 @@ def test_fingers_that_cannot_touch_are_named(urdf: Path) -> None:
         adapt(urdf, str(URDF_PATH))
 
 
-@pytest.mark.parametrize("finger", ["LFinger13", "RThumb2"])
-def test_a_finger_whose_mesh_is_a_text_is_named(urdf: Path, finger: str) -> None:
+def test_a_finger_whose_mesh_is_a_text_is_named(urdf: Path) -> None:
+    finger = "RThumb2"
     (urdf.parents[2] / "nao_meshes" / "meshes" / "text.stl").write_text("a pointer")
     at = f"link[@name='{finger}_link']/collision/geometry/mesh"
 
@@ -397,21 +375,3 @@ def test_the_users_nao_acts_and_feels_like_ours(env: gym.Env) -> None:
     again, _ = env.reset(seed=0)  # builds the scene anew
     assert again["agent"]["proprioception"].isfinite().all()
     assert obs["sensor_data"]["front_camera"]["rgb"].float().std() > 10
-
-
-def test_a_class_may_name_the_file_instead(urdf: Path) -> None:
-    class MyNao(Nao):
-        uid = "my_nao"
-        urdf_path = str(urdf)
-
-    with gym.make(
-        "NaoTouchCubeSingle-v1",
-        robot_uids=MyNao,
-        obs_mode="state_dict",
-        render_backend="none",
-    ) as env:
-        env.reset(seed=0)
-        for _ in range(3):
-            obs = env.step(env.action_space.sample())[0]
-        assert obs["agent"]["proprioception"].isfinite().all()
-        assert env.unwrapped.agent.urdf_path == str(urdf)

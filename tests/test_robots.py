@@ -328,11 +328,6 @@ def test_what_a_driven_joint_lacks_is_named(
         read_motors(path, ("lift", "bend_1"))
 
 
-def test_a_file_that_is_missing_is_named(tmp_path: Path) -> None:
-    with pytest.raises(RobotError, match="moon.urdf: no such file"):
-        read_motors(tmp_path / "moon.urdf", ())
-
-
 @pytest.mark.parametrize(
     ("changes", "named"),
     [

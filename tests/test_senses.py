@@ -177,15 +177,6 @@ def test_a_sense_of_ones_own_is_one_entry(own_senses) -> None:
         AgentConfig(senses=("touch", "clock"))
 
 
-def test_what_only_the_simulator_knows_is_standardized_with_the_rest(own_senses):
-    weight = Term("weight", "privileged", "1", sense="state")
-    senses.register(weight)
-    obs = observation(1, privileged=True)
-    before = flatten(obs)["privileged"].shape[1]
-    obs["extra"]["weight"] = torch.ones(1, 1)
-    assert flatten(obs)["privileged"].shape[1] == before + 1
-
-
 @pytest.mark.parametrize(
     ("term", "message"),
     [

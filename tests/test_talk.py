@@ -21,7 +21,7 @@ from ir_maniskill.language.tokens import VOCABULARY
 from ir_maniskill.talk import cards, film, live, meshes
 from ir_maniskill.talk.page import Page, side_by_side
 from ir_maniskill.talk.players import RANDOM, RandomMotion
-from ir_maniskill.talk.reading import LONGEST, clean, grounded, in_words, names, read
+from ir_maniskill.talk.reading import LONGEST, clean, grounded, in_words, read
 from ir_maniskill.talk.session import Run, Score, Session
 
 RED = "Touch the red cube."
@@ -38,38 +38,30 @@ def heard(text):
     return read(text, KNOWN, scene(), VOCABULARY)
 
 
-@pytest.mark.parametrize("text", [RED, "touch the RED cube", "Touch, the red cube!"])
-def test_a_sentence_of_the_task_is_said_as_the_task_says_it(text):
-    reading = heard(text)
-    assert reading.said == RED and reading.goal == KNOWN[1].goal
-    assert reading.objects == (1,) and reading.unknown == ()
+PUSH = "Push the red cube to the left."
 
 
 @pytest.mark.parametrize(
-    "text", ["please tap the crimson block", "Touch the leftmost one."]
+    ("text", "said", "meaning", "unknown"),
+    [
+        ("Touch, the RED cube!", RED, "touch the red cube", ()),
+        # Other words for what the task asks for are said as its sentence.
+        ("please tap the crimson block", RED, "touch the red cube", ()),
+        ("Touch the leftmost one.", RED, "touch the red cube", ()),
+        (PUSH, PUSH, "push the red cube to the left", ("push", "to", "left")),
+    ],
 )
-def test_other_words_for_a_goal_of_the_task_are_said_as_its_sentence(text):
+def test_a_sentence_is_said_as_the_policy_knows_it(text, said, meaning, unknown):
     reading = heard(text)
-    assert reading.said == RED and reading.unknown == ()
-    assert reading.heard == clean(text) and reading.meaning == "touch the red cube"
-
-
-def test_what_the_task_does_not_ask_for_is_said_as_it_is():
-    reading = heard("Push the red cube to the left.")
-    assert reading.said == reading.heard and reading.goal == Push(
-        Ref("red", "cube"), "left"
-    )
-    assert reading.unknown == ("push", "to", "left")
-    assert reading.meaning == "push the red cube to the left"
+    assert (reading.heard, reading.said) == (clean(text), said)
+    assert (reading.meaning, reading.unknown) == (meaning, unknown)
+    assert reading.objects == (1,)
 
 
 def test_nonsense_has_no_goal_and_says_what_was_expected():
     reading = heard("Dance!")
     assert reading.goal is None and reading.unknown == ("dance",)
     assert "'dance' as word 1" in reading.meaning and reading.meaning.endswith("...")
-
-
-def test_an_object_that_is_not_there_is_told():
     reading = heard("Touch the purple cube.")
     assert reading.goal is None
     assert reading.meaning.startswith("the purple cube fits 0 objects here")
@@ -92,7 +84,7 @@ def test_what_is_typed_is_brought_onto_one_line():
     ],
 )  # fmt: skip
 def test_goals_are_told_in_plain_words(goal, words):
-    assert in_words(grounded(goal, scene()), names(scene())) == words
+    assert in_words(grounded(goal, scene())) == words
 
 
 # -- The session -----------------------------------------------------------------------
@@ -275,7 +267,7 @@ def test_what_is_typed_is_never_markup():
     nasty = "<script>alert(1)</script> <img src=x onerror=alert(1)>"
     reading = dataclasses.replace(heard(nasty), said=nasty, meaning=nasty)
     shown = cards.sentence_card(reading, Score()) + cards.note_card(nasty, nasty)
-    shown += cards.run_card(Run("x", (nasty,)))
+    shown += cards.run_card(Run((nasty,)))
     assert "<script" not in shown and "<img" not in shown
 
 
@@ -284,7 +276,7 @@ def test_the_card_tells_what_came_of_a_sentence():
     assert "not yet" in cards.sentence_card(reading, Score())
     shown = cards.sentence_card(reading, Score(success_once=True, wrong=1, steps=60))
     assert "was reached" in shown and "1 wrong touch<" in shown and "3 s" in shown
-    run = cards.run_card(Run("x", ("a", "b"), (True, False)))
+    run = cards.run_card(Run(("a", "b"), (True, False)))
     assert "1 of 2 reached" in run and "✓" in run and "✗" in run
 
 

@@ -7,16 +7,13 @@ import subprocess
 import sys
 import textwrap
 from collections.abc import Iterator
-from pathlib import Path
 
 import gymnasium as gym
-import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
-from mani_skill.utils.wrappers.record import RecordEpisode
 from trees import leaves
 
 import ir_maniskill
@@ -150,23 +147,6 @@ def test_an_episode_is_finite_and_ends_by_time_alone(env: gym.Env) -> None:
         )
 
 
-def test_state_survives_the_round_trip(env: gym.Env) -> None:
-    base = env.unwrapped
-    for get, put in (
-        (base.get_state, base.set_state),
-        (base.get_state_dict, base.set_state_dict),
-    ):
-        env.reset(seed=4)
-        for action in actions(5):
-            env.step(action)
-        saved, flat = get(), base.get_state().clone()
-        sentence = base.get_language_instruction()
-        env.reset(seed=5)
-        put(saved)
-        assert base.get_language_instruction() == sentence
-        torch.testing.assert_close(base.get_state(), flat)
-
-
 # -- Modes ----------------------------------------------------------------------------
 
 
@@ -180,20 +160,6 @@ def test_the_defaults_are_the_papers() -> None:
         assert picture.float().std() > 10  # there is something to see
     assert env.unwrapped.control_mode == "pd_joint_pos"
     assert env.unwrapped.reward_mode == "sparse"
-    env.close()
-
-
-@pytest.mark.parametrize("mode", ["state", "state_dict", "rgb", "rgbd"])
-def test_observation_modes(mode: str) -> None:
-    cameras = {"width": 16, "height": 32, "shader_pack": "trivial"}
-    env = gym.make("NaoTouchButtonMulti-v1", obs_mode=mode, sensor_configs=cameras)
-    obs, _ = env.reset(seed=0)
-    if mode == "state":
-        assert obs.shape == (1, 26 * 3 + 6 + 5 + 9 + 18 + 3 + 6 + 1 + 1)
-    else:
-        data = obs.get("sensor_data", {}).get("top_camera", {})
-        assert set(data) == {"rgb": {"rgb"}, "rgbd": {"rgb", "depth"}}.get(mode, set())
-        assert ("object_position" in obs["extra"]) == (mode == "state_dict")
     env.close()
 
 
@@ -244,7 +210,7 @@ def test_actions_of_all_kinds_are_taken_and_those_not_finite_refused(
         ([0.0] * 25, r"got shape \(25,\), expected \(1, 26\)"),
         (torch.zeros(2, 26), r"got shape \(2, 26\)"),
         (np.zeros(26, complex), "got complex numbers"),
-        ("left", "got ndarray .*, expected numbers"),
+        ("left", "got str .*, expected numbers"),
     ):
         with pytest.raises(ValueError, match=message):
             fixed.step(bad)
@@ -483,26 +449,6 @@ def test_the_named_object_costs_by_its_own_speed() -> None:
 
 
 # -- At home in its ecosystem ---------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_record_episode_writes_a_playable_video(tmp_path: Path) -> None:
-    env = gym.make(
-        "NaoTouchCubeMulti-v1",
-        obs_mode="state_dict",
-        render_mode="rgb_array",
-        human_render_camera_configs={"width": 128, "height": 96},
-    )
-    env = RecordEpisode(env, str(tmp_path), video_fps=20, save_trajectory=True)
-    env.reset(seed=0)
-    for action in actions(32):
-        env.step(action)
-    env.close()
-    (video,) = tmp_path.glob("*.mp4")
-    frames = iio.imread(video)
-    assert frames.shape[0] >= 32
-    assert frames.astype(float).std() > 10
-    assert list(tmp_path.glob("*.h5"))
 
 
 @pytest.mark.slow

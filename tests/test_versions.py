@@ -1,6 +1,5 @@
-"""The range of Python that is stated, and the locked set of what is installed."""
+"""The locked set of what is installed, and types for those who use it."""
 
-import re
 import subprocess
 import sys
 from importlib import metadata
@@ -12,22 +11,6 @@ from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[1]
-PYPROJECT = (ROOT / "pyproject.toml").read_text()
-PYTHONS = ["3.10", "3.11", "3.12"]
-
-
-# -- Python ----------------------------------------------------------------------------
-
-
-def test_the_range_of_python_is_stated_alike_everywhere() -> None:
-    (stated,) = re.findall(r'^requires-python = "(.+)"$', PYPROJECT, re.MULTILINE)
-    candidates = [f"3.{minor}" for minor in range(6, 20)]
-    assert list(SpecifierSet(stated).filter(candidates)) == PYTHONS
-    listed = re.findall(r'"Programming Language :: Python :: (3\.\d+)"', PYPROJECT)
-    assert listed == PYTHONS
-    assert " | ".join(PYTHONS) in (ROOT / "scripts" / "create_venv.sh").read_text()
-    assert f'target-version = "py{PYTHONS[0].replace(".", "")}"' in PYPROJECT
-    assert f'\npython_version = "{PYTHONS[0]}"' in PYPROJECT
 
 
 # -- The locked set --------------------------------------------------------------------
@@ -36,14 +19,13 @@ CUDA = ("cuda", "nvidia", "triton")
 """Beginnings of the names of what torch brings along, exactly pinned, for a GPU."""
 
 
-def pins(python: str | None = None) -> dict[str, SpecifierSet]:
-    """Return what constraints.txt pins, for this Python or another."""
-    environment = {"python_version": python} if python else None
+def pins() -> dict[str, SpecifierSet]:
+    """Return what constraints.txt pins."""
     found: dict[str, SpecifierSet] = {}
     for line in (ROOT / "constraints.txt").read_text().splitlines():
         if not line.startswith("#"):
             pin = Requirement(line)
-            if pin.marker is None or pin.marker.evaluate(environment):
+            if pin.marker is None or pin.marker.evaluate():
                 name = canonicalize_name(pin.name)
                 assert name not in found, f"{name} is pinned twice"
                 found[name] = pin.specifier
@@ -82,20 +64,6 @@ def test_everything_that_is_needed_is_pinned_as_installed() -> None:
         for name, version in sorted(installed.items())
         if not pinned[name].contains(version, prereleases=True)
     ] == []
-
-
-def test_the_pins_are_in_the_ranges_that_are_asked_for() -> None:
-    pinned = pins()
-    for by, what in needed():
-        (pin,) = pinned[canonicalize_name(what.name)]
-        assert what.specifier.contains(pin.version, prereleases=True), f"{by}: {what}"
-
-
-@pytest.mark.parametrize("python", PYTHONS)
-def test_every_python_has_one_exact_version_of_each(python: str) -> None:
-    assert all(re.fullmatch("==[^*]+", str(pin)) for pin in pins(python).values())
-    only_later = pins("3.11").keys() - pins(python).keys()
-    assert only_later <= {"ipython-pygments-lexers"}  # part of IPython 8 on 3.10
 
 
 # -- Types -----------------------------------------------------------------------------

@@ -47,12 +47,6 @@ def light(finger):
     return (x + 112 + 88 * (finger % 3), y + 22 + 56 * (finger // 3), 4, 4)
 
 
-def test_a_frame_has_the_promised_size():
-    frame = draw(snapshot())
-    assert frame.shape == (720, 1280, 3) and frame.dtype == np.uint8
-    assert (frame.shape[1], frame.shape[0]) == SIZE
-
-
 @pytest.mark.parametrize(("rows", "columns"), [(64, 32), (48, 48), (30, 60)])
 def test_the_policys_pictures_are_shown_whole_and_not_stretched(rows, columns):
     corner = np.full((rows, columns, 3), 200, np.uint8)
@@ -100,6 +94,7 @@ def test_the_timeline_shows_what_each_step_touched():
 
 def test_the_view_and_the_pictures_are_shown():
     frame = draw(snapshot())
+    assert (frame.shape, frame.dtype) == ((SIZE[1], SIZE[0], 3), np.uint8)
     assert share(frame, video.VIEW, (127, 127, 127)) > 0.99
     for box in video.PICTURES:
         assert share(frame, box, (200, 200, 200)) > 0.98
@@ -155,11 +150,9 @@ def test_mp4_uses_the_colors_every_player_knows(tmp_path):
     assert facts["fps"] == 10
 
 
-def test_other_names_and_empty_videos_are_refused(tmp_path):
+def test_other_names_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"got .*a.avi, expected"):
         write_video(tmp_path / "a.avi", [snapshot()])
-    with pytest.raises(ValueError, match="at least one"):
-        write_video(tmp_path / "a.gif", [])
 
 
 def test_letters_of_other_alphabets_are_no_boxes():
@@ -263,27 +256,6 @@ def test_learning_curve_draws_a_run(tmp_path):
     assert path == tmp_path / "learning_curve.png" and plain.shape[1] == 1200
     write_metrics(tmp_path, "evaluations.csv", [{"steps": 4096, "eval/success": 0.5}])
     assert not np.array_equal(imageio.imread(plots.learning_curve(tmp_path)), plain)
-
-
-@pytest.mark.parametrize("mark", ["\ufeff", ""])
-def test_a_curve_can_be_drawn_of_what_an_office_program_saved(tmp_path, mark):
-    rows = [{"steps": 2048 * i, "train/return": i / 4} for i in range(4)]
-    write_metrics(tmp_path, "metrics.csv", rows)
-    plain = imageio.imread(plots.learning_curve(tmp_path))
-    table = tmp_path / "metrics.csv"
-    text = mark + table.read_text().replace(",", ";").replace(".", ",")
-    table.write_text(text, encoding="utf-8")
-    drawn = plots.learning_curve(tmp_path, tmp_path / "B.PNG")
-    assert np.array_equal(imageio.imread(drawn), plain)
-
-
-def test_a_curve_leaves_out_a_row_that_a_kill_cut_short(tmp_path):
-    rows = [{"steps": 2048 * i, "train/return": i} for i in range(3)]
-    write_metrics(tmp_path, "metrics.csv", rows)
-    whole = imageio.imread(plots.learning_curve(tmp_path))
-    with (tmp_path / "metrics.csv").open("a") as file:
-        file.write("6144")
-    assert np.array_equal(imageio.imread(plots.learning_curve(tmp_path)), whole)
 
 
 def test_learning_curve_of_no_run_or_a_broken_one_says_so(tmp_path):

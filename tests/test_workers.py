@@ -123,14 +123,6 @@ def test_memory_that_does_not_suffice_is_told_at_once(
         assert not os.listdir(tmp_path)
 
 
-def test_a_place_without_shared_memory_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(shared_rows, "FOLDER", tmp_path / "none")
-    with pytest.raises(OSError, match="No such file.* in .*none; enlarge it"):
-        shared_rows.reserve(1)
-
-
 # -- Fail, die or hang -----------------------------------------------------------------
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from reprlib import repr as short
 from typing import Any
 
@@ -30,8 +30,9 @@ def seeds_of(seed: int | Sequence[int], num_envs: int) -> list[int]:
     """
     given = _plain(seed)
     seeds = [given + row for row in range(num_envs)] if _whole(given) else given
-    if isinstance(seeds, list) and len(seeds) == num_envs and _all_in(SEEDS, seeds):
-        return seeds
+    each = seeds if isinstance(seeds, list) else []
+    if len(each) == num_envs and all(_whole(one) and one in SEEDS for one in each):
+        return each
     raise ValueError(
         f"seed: got {short(given)}, expected an integer (env i gets seed + i) or "
         f"{num_envs} of them, so that each env's is from 0 to {SEEDS[-1]}"
@@ -157,48 +158,17 @@ def action_of(action: Any, shape: tuple[int, ...]) -> Tensor:
         ValueError: It has another shape than [N, J], or [J] of one env, or is no
             numbers.
     """
-    if not isinstance(action, Tensor):  # a copy: strides may be negative
-        action = _numbers(np.array, action, shape)
-    given = _numbers(torch.as_tensor, action, shape).detach()
+    try:  # of what is no tensor a copy: strides may be negative
+        plain = action if isinstance(action, Tensor) else np.array(action)
+        given = torch.as_tensor(plain).detach()
+    except (TypeError, ValueError, RuntimeError) as error:
+        got = f"{type(action).__name__} ({error})"
+        raise ValueError(f"action: got {got}, expected numbers {shape}") from None
     if given.is_complex():
         raise ValueError(f"action: got complex numbers, expected real ones {shape}")
     if given.shape != shape and (1, *given.shape) != shape:
         raise ValueError(f"action: got shape {tuple(given.shape)}, expected {shape}")
     return given.float()
-
-
-def _numbers(read: Callable[[Any], Any], given: Any, shape: tuple[int, ...]) -> Any:
-    """Return what `read` makes of an action; ValueError: nothing."""
-    try:
-        return read(given)
-    except (TypeError, ValueError, RuntimeError) as error:
-        got = f"{type(given).__name__} ({error})"
-        raise ValueError(f"action: got {got}, expected numbers {shape}") from None
-
-
-def actions_of(actions: Any, shape: tuple[int, ...] | None) -> np.ndarray:
-    """Return actions of any kind of numbers, on any device, as float32 [N, J].
-
-    Raises:
-        ValueError: They have another shape, are not finite or no numbers.
-    """
-    try:
-        if isinstance(actions, Tensor):
-            kind = actions.dtype if actions.is_complex() else torch.float32
-            actions = actions.detach().to("cpu", kind).numpy()
-        with np.errstate(over="ignore"):  # infinity, which is refused below
-            array = np.asarray(actions)
-            if np.iscomplexobj(array):
-                raise TypeError("complex numbers")
-            array = array.astype(np.float32, copy=False)
-    except (TypeError, ValueError, RuntimeError) as error:
-        got = f"{type(actions).__name__} ({error})"
-        raise ValueError(f"actions: got {got}, expected numbers {shape}") from None
-    if array.shape != shape:
-        raise ValueError(f"actions: got shape {array.shape}, expected {shape}")
-    if not np.isfinite(array).all():
-        raise ValueError("actions: got NaN or infinity, expected finite numbers")
-    return array
 
 
 def _deal(name: str, value: Any, experiment: Experiment, num_envs: int) -> list:
@@ -241,7 +211,3 @@ def _plain(given: Any) -> Any:
 
 def _whole(given: Any) -> bool:
     return isinstance(given, int) and not isinstance(given, bool)
-
-
-def _all_in(numbers: range, given: list) -> bool:
-    return all(_whole(one) and one in numbers for one in given)

@@ -20,16 +20,6 @@ TOUCH_FORCE = 0.01
 """Force from which a contact counts as a touch [N]."""
 
 
-def touch_sensor(
-    scene: ManiSkillScene,
-    fingers: Sequence[Sequence[Link]],
-    objects: Sequence[Actor],
-) -> CpuTouchSensor | GpuTouchSensor:
-    """Return the sensor for the backend that `scene`, which is set up, runs on."""
-    kind = GpuTouchSensor if scene.gpu_sim_enabled else CpuTouchSensor
-    return kind(scene, fingers, objects)
-
-
 class CpuTouchSensor:
     """Reads the contact list of PhysX on the CPU, where N is 1."""
 

@@ -132,12 +132,11 @@ class GoalBatch:
         def pick(value: Tensor | GoalBatch) -> Tensor | GoalBatch:
             return value.rows(index) if isinstance(value, GoalBatch) else value[index]
 
-        return GoalBatch(
-            tuple(
-                (c[index], kind, SimpleNamespace(**_mapped(pick, vars(asked))))
-                for c, kind, asked in self.parts
-            )
-        )
+        parts = []
+        for chosen, kind, asked in self.parts:
+            picked = {name: pick(value) for name, value in vars(asked).items()}
+            parts.append((chosen[index], kind, SimpleNamespace(**picked)))
+        return GoalBatch(tuple(parts))
 
 
 class GoalTable:
@@ -204,10 +203,6 @@ def _column(name: str, values: list[Any], hands: Mapping[str, Tensor]) -> Deal:
         f"field {name!r} of a goal: got {values[0]!r}, expected a Ref, a Goal, a "
         "number, or a field named `hand` or `direction`"
     )
-
-
-def _mapped(function: Callable, values: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: function(value) for name, value in values.items()}
 
 
 def _indexed(column: Tensor) -> Deal:

@@ -24,7 +24,7 @@ from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
 from ir_maniskill.environment import senses
-from ir_maniskill.environment.arguments import actions_of, options_of, seeds_of
+from ir_maniskill.environment.arguments import action_of, options_of, seeds_of
 from ir_maniskill.environment.host_tensor import HostTensor
 from ir_maniskill.environment.shared_rows import SharedRows, Tree, map_leaves, reserve
 from ir_maniskill.environment.worker import ENDS, work
@@ -172,9 +172,11 @@ class ProcessVectorEnv(VectorEnv):
 
     def step_async(self, actions: Tensor | np.ndarray) -> None:
         """Send the actions and return at once; `step_wait` must follow."""
-        array = actions_of(actions, self.action_space.shape)
+        given = action_of(actions, self.action_space.shape or ()).cpu()
+        if not given.isfinite().all():
+            raise ValueError("action: got NaN or infinity, expected finite numbers")
         self._require_idle()
-        self._shared.views["action"][:] = array
+        self._shared.views["action"][:] = given.numpy()
         self._send("step", [None] * len(self._pipes))
 
     def step_wait(self) -> Step:

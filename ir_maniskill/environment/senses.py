@@ -311,18 +311,16 @@ class StateStack:
             obs: The newest observation; where `done`, the first of a new episode.
             done: Envs whose history starts anew [N] bool; none if left out.
         """
-        self._state = self._pushed(obs, done)
+        self._state = self.peek(obs, done)
         return dict(self._state)
 
-    def peek(self, obs: Observation) -> State:
-        """Return the state that `push(obs)` would give, and change nothing.
+    def peek(self, obs: Observation, done: Tensor | None = None) -> State:
+        """Return the state that `push` would give, and change nothing.
 
         Args:
             obs: E.g. the final observation of an episode.
+            done: As for `push`.
         """
-        return self._pushed(obs, None)
-
-    def _pushed(self, obs: Observation, done: Tensor | None) -> State:
         state = flatten(obs)
         for name in _stacked(state):
             newest = state[name]

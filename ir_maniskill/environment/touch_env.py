@@ -167,8 +167,8 @@ class TouchEnv(RenderedEnv):
     def _after_reconfigure(self, options: dict) -> None:
         task, count, device = self.experiment, self.num_envs, self.device
         hands = {
-            name: torch.tensor(fingers, device=device)
-            for name, fingers in _hands(self.agent).items()
+            hand: torch.tensor([f in mine for f in self.agent.fingers], device=device)
+            for hand, mine in self.agent.hands.items()
         }
         self.instructional_set = InstructionalSet(task, hands, device, count)
         self._layout = layout_of(task, self.agent)
@@ -501,14 +501,6 @@ class TouchEnv(RenderedEnv):
         self.set_state_dict(
             {"controller": {"target_qpos": target}, "task": leaves}, env_idx
         )
-
-
-def _hands(robot: Robot) -> dict[str, list[bool]]:
-    """Return which fingers belong to each hand, [F] each."""
-    return {
-        hand: [finger in fingers for finger in robot.fingers]
-        for hand, fingers in robot.hands.items()
-    }
 
 
 def _require_one_on_cpu(kwargs: dict[str, Any]) -> None:

@@ -145,7 +145,8 @@ def audit(
 def _all_rows(
     player: Player, task: Experiment, make: Make, episodes: int, seed: int
 ) -> Iterator[list[Row]]:
-    told, seeds = _turns(task, episodes), range(seed, seed + episodes)
+    count, seeds = len(task.sentences), range(seed, seed + episodes)
+    told = [e % count if count else None for e in range(episodes)]
     with closing(make()) as envs:
         figures, names = play(player, envs, told, seeds)
         yield [_row("who", "the policy", figures)]
@@ -158,18 +159,12 @@ def _all_rows(
         for name, change in controls(task, envs.single_observation_space).items():
             changed, _ = play(_changed(player, change), envs, told, seeds)
             yield [_row("without", name, changed)]
-        if len(task.sentences) != 1:
-            scenes = max(1, episodes // (len(task.sentences) or SENTENCES))
+        if count != 1:
+            scenes = max(1, episodes // (count or SENTENCES))
             yield same_scene(player, envs, scenes=scenes, seed=seed)
     for split in SPLITS[1:] if isinstance(task.instructions, Spoken) else ():
         with closing(make(split=split)) as envs:
             yield [_row("split", split, play(player, envs, told, seeds)[0])]
-
-
-def _turns(task: Experiment, episodes: int) -> list[int | None]:
-    """Return what is told: the task's sentences in turn, or what is drawn."""
-    count = len(task.sentences)
-    return [e % count if count else None for e in range(episodes)]
 
 
 def _row(group: str, name: str, figures: Tensor) -> Row:

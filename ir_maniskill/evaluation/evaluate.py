@@ -54,11 +54,7 @@ class Rate:
     """Episodes played."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.count <= self.total or self.total < 1:
-            raise ValueError(
-                f"rate: got {self.count} of {self.total}, expected 0 <= count <= total "
-                "and at least one episode"
-            )
+        assert 0 <= self.count <= self.total and self.total > 0, self
 
     @property
     def value(self) -> float:
@@ -139,13 +135,8 @@ class EvaluationReport:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
-        return {
-            "env_id": self.env_id,
-            "seed": self.seed,
-            "episodes": self.episodes,
-            "instructions": {k: v.as_dict() for k, v in self.instructions.items()},
-            "overall": self.overall.as_dict(),
-        }
+        each = {name: score.as_dict() for name, score in self.instructions.items()}
+        return {**vars(self), "instructions": each, "overall": self.overall.as_dict()}
 
     def __str__(self) -> str:
         rows = [*self.instructions.items(), ("all", self.overall)]

@@ -28,6 +28,8 @@ from ir_maniskill.goals import DIRECTIONS, SHAPES, Avoid, Goal, Push, Then, Touc
 from ir_maniskill.snapshot import Snapshot
 
 Array = NDArray[np.float64]
+Tips = tuple[int, ...]
+"""Which fingers of a hand touch."""
 
 # -- Weights of the least squares, each of a unit of its residual ----------------------
 
@@ -41,6 +43,8 @@ ACROSS = 0.3
 """Of fingers that are not side by side behind what they push."""
 DOWN = 0.86
 """How far down a hand is to point; level is 0."""
+SAMPLES = 6000
+"""Random postures of a hand that searches may start from."""
 
 # -- Sizes and way points --------------------------------------------------------------
 
@@ -94,14 +98,8 @@ class Aim:
 class Arm:
     """An arm and its hand: where it is by its numbers, and the numbers for an aim."""
 
-    def __init__(self, robot: Robot, hand: str, samples: int = 6000) -> None:
-        """Read the robot's kinematics, and try random postures to start searches from.
-
-        Args:
-            robot: One whose hand it is.
-            hand: Its name.
-            samples: How many postures.
-        """
+    def __init__(self, robot: Robot, hand: str) -> None:
+        """Read a hand's kinematics, and try random postures to start searches from."""
         self.scale, fingers = robot.scale, robot.hands[hand]
         articulation = robot.robot
         self._model = articulation._objs[0].create_pinocchio_model()
@@ -122,6 +120,8 @@ class Arm:
             names.index(n) for n in (*itertools.chain(*parts), palm, upper[1])
         ]
         count = np.cumsum([len(part) for part in parts])
+        balls = len(self._links) - 2 + len(chains), 5  # of fingers, of the rest
+        self._radii = np.repeat([FINGER, PALM], balls)  # of `Hand.balls` [P]
         self._first, self._last = count - [len(part) for part in parts], count - 1
         self.shoulder = articulation.links_map[moved[self.joints[0]]].pose.p[0].cpu()
         self.shoulder = self.shoulder.numpy().astype(float) / self.scale
@@ -130,7 +130,7 @@ class Arm:
         """Which fingers may be what touches, the best first."""
         self.rest = np.zeros(len(moved))
         """All joints, of which those that are not the hand's stay so [J] [rad]."""
-        self._tables = {tips: self._table(tips, samples) for tips in self.tips}
+        self._tables = {tips: self._table(tips) for tips in self.tips}
 
     def numbers(self, joints: Array) -> Array:
         """Return the numbers of the hand, of all joints [J]: [X]."""
@@ -146,7 +146,7 @@ class Arm:
 
     # -- Where it is -----------------------------------------------------------------
 
-    def hand(self, x: Array, tips: tuple[int, ...]) -> Hand:
+    def hand(self, x: Array, tips: Tips) -> Hand:
         """Return where the hand is with these numbers [X], touching with `tips`."""
         qpos = np.empty(len(self.rest))
         qpos[self._order] = self.to_joints(x, self.rest)
@@ -164,20 +164,16 @@ class Arm:
         balls = np.concatenate([fingers, pads, solid])
         return Hand(tip, _unit(tip - palm), _unit(across), balls)
 
-    def _radii(self, balls: Array) -> Array:
-        fingers = np.arange(balls.shape[-2]) < balls.shape[-2] - 5
-        return np.where(fingers, FINGER, PALM)
-
-    def miss(self, x: Array, tips: tuple[int, ...], aim: Aim) -> float:
+    def miss(self, x: Array, tips: Tips, aim: Aim) -> float:
         """Return how far the tip is from its aim, and the hand in what is there [m]."""
         hand = self.hand(x, tips)
-        room = clearance(hand.balls, self._radii(hand.balls), aim.boxes)
+        room = clearance(hand.balls, self._radii, aim.boxes)
         away = 0.0 if aim.tip is None else np.linalg.norm(hand.tip - aim.tip)
         return float(away + max(0.0, -room.min(initial=0.0)))
 
     # -- The numbers for an aim --------------------------------------------------------
 
-    def search(self, tips: tuple[int, ...], aim: Aim, starts: int = 4) -> Array:
+    def search(self, tips: Tips, aim: Aim) -> Array:
         """Return numbers for an aim, from the best of the postures tried before."""
         hands, low = self._tables[tips][1:]
         assert aim.tip is not None
@@ -185,13 +181,14 @@ class Arm:
         cost += STEEP**2 * ((hands.pointing - self._steep(aim.tip)) ** 2).sum(1)
         near = np.argpartition(cost, 150)[:150]
         for i in near:
-            room = clearance(hands.balls[i], self._radii(hands.balls[i]), aim.boxes)
+            room = clearance(hands.balls[i], self._radii, aim.boxes)
             cost[i] += AT_TIP**2 * (np.minimum(room - aim.margins, 0) ** 2).sum()
-        best = near[np.argsort(cost[near])[:starts]]
+        best = near[np.argsort(cost[near])[:4]]
         found = [self.improve(self._tables[tips][0][i], tips, aim, 15) for i in best]
-        return min(found, key=lambda x: self._cost(x, tips, aim, x))
+        residuals = [self._residual(x, tips, aim, x) for x in found]
+        return found[np.argmin([r @ r for r in residuals])]
 
-    def improve(self, x: Array, tips: tuple[int, ...], aim: Aim, steps: int) -> Array:
+    def improve(self, x: Array, tips: Tips, aim: Aim, steps: int) -> Array:
         """Return numbers nearer to an aim: damped least squares (Levenberg-Marquardt).
 
         dx = -(J^T J + lambda I)^-1 J^T r, with J by finite differences.
@@ -218,13 +215,10 @@ class Arm:
                 damping *= 8
         return x
 
-    def _residual(
-        self, x: Array, tips: tuple[int, ...], aim: Aim, first: Array
-    ) -> Array:
+    def _residual(self, x: Array, tips: Tips, aim: Aim, first: Array) -> Array:
         hand = self.hand(x, tips)
-        radii = self._radii(hand.balls)
-        room = clearance(hand.balls, radii, aim.boxes) - aim.margins
-        above = hand.balls[:, 2] - radii - TABLE_TOP - 0.004
+        room = clearance(hand.balls, self._radii, aim.boxes) - aim.margins
+        above = hand.balls[:, 2] - self._radii - TABLE_TOP - 0.004
         parts = [AT_TIP * np.minimum(np.append(room.ravel(), above), 0)]
         if aim.tip is None:
             return np.concatenate([*parts, x - first])
@@ -234,27 +228,23 @@ class Arm:
         tip = AT_TIP * (hand.tip - aim.tip)
         return np.concatenate([*parts, tip, pointing, STAY * (x - first)])
 
-    def _cost(self, *args: Any) -> float:
-        r = self._residual(*args)
-        return float(r @ r)
-
     def _steep(self, tip: Array) -> Array:
         """Return how the hand is to point at a place: down, and away from the body."""
         level = _unit((tip - self.shoulder) * (1, 1, 0))
         return 0.5 * level - np.array([0, 0, DOWN])
 
-    def _table(self, tips: tuple[int, ...], samples: int) -> tuple[Array, Hand, Array]:
+    def _table(self, tips: Tips) -> tuple[Array, Hand, Array]:
         """Return random numbers, the hands that they make, and what these cost."""
-        uniform = np.random.default_rng(0).uniform(size=(samples, len(self.joints) + 1))
+        uniform = np.random.default_rng(0).uniform(size=(SAMPLES, len(self.joints) + 1))
         low, high = self._low[self.joints], self._high[self.joints]
         numbers = uniform * np.append(high - low, 1) + np.append(low, 0)
         tried = zip(*(self.hand(x, tips) for x in numbers), strict=True)
         hands = Hand(*map(np.array, tried))
-        above = (hands.balls[..., 2] - self._radii(hands.balls)).min(axis=1) - TABLE_TOP
+        above = (hands.balls[..., 2] - self._radii).min(axis=1) - TABLE_TOP
         return numbers, hands, AT_TIP**2 * np.minimum(above, 0) ** 2
 
 
-def _tips(fingers: int) -> list[tuple[int, ...]]:
+def _tips(fingers: int) -> list[Tips]:
     """Return which fingers of a hand may touch: the first two, or the last alone."""
     return [(0, 1), (fingers - 1,)] if fingers > 2 else [tuple(range(fingers))]
 
@@ -298,7 +288,7 @@ class Act:
     """What."""
     index: int
     """The object's place in the snapshot."""
-    tips: tuple[int, ...]
+    tips: Tips
     """Which fingers touch."""
     x: Array
     """Numbers of the hand at its way point [X]."""
@@ -377,68 +367,48 @@ class Scripted:
             self._episodes[row] = episode = Episode(view.stage, 0, acts, {}, tips)
         episode.steps += 1
         for hand, arm in self.arms.items():
-            x = self._next(
-                arm, hand, episode, view, arm.numbers(now), arm.numbers(wanted)
-            )
+            x = self._next(hand, episode, view, now, wanted)
             if x is not None:
                 wanted[:] = arm.to_joints(x, wanted)
 
     def _next(
-        self,
-        arm: Arm,
-        hand: str,
-        episode: Episode,
-        view: View,
-        now: Array,
-        target: Array,
+        self, hand: str, episode: Episode, view: View, joints: Array, wanted: Array
     ) -> Array | None:
         """Return the next numbers of a hand; None: it stays as it is."""
-        act, mine = episode.acts.get(hand), [a.index for a in episode.acts.values()]
+        arm, act = self.arms[hand], episode.acts.get(hand)
+        now, target = arm.numbers(joints), arm.numbers(wanted)
+        lifts, start = episode.steps <= LIFT, episode.begun[hand]
         if act is None:
-            tips, mine = arm.tips[0], []
-            lifted = episode.begun[hand] + (0, 0, 0.06)
-            wait = lifted if episode.steps <= LIFT else ASIDE * (1, arm.side, 1)
-            aim = view.aim(wait, mine)
-            x = episode.idle.get(hand, now)
+            tips = arm.tips[0]
+            wait = np.add(start, (0, 0, 0.06)) if lifts else ASIDE * (1, arm.side, 1)
+            aim, x = view.aim(wait, []), episode.idle.get(hand, now)
             x = episode.idle[hand] = arm.improve(x, tips, aim, 1)
         else:
-            tips = act.tips
-            found = self._way_point(arm, hand, act, view, now)
+            tips, mine = act.tips, [a.index for a in episode.acts.values()]
+            found = self._way_point(hand, act, view, now)
             if found is None:  # a push ends at once, a touch is held
                 return now if isinstance(act.goal, Push) else None
-            tip, margin = found
-            push = (
-                np.array(DIRECTIONS[act.goal.direction])
-                if isinstance(act.goal, Push)
-                else None
-            )
-            if episode.steps <= LIFT:
-                aim = view.aim(episode.begun[hand] + (0, 0, 0.05), mine, 0.004)
+            if lifts:
+                aim = view.aim(np.add(start, (0, 0, 0.05)), mine, 0.004)
                 x = arm.improve(now, tips, aim, 3)
             else:
-                aim = view.aim(tip, mine, margin, push)
+                aim = view.aim(found[0], mine, found[1], _way(act.goal))
                 x = act.x = arm.improve(act.x, tips, aim, 3)
         x = target + np.clip(x - target, -FAST, FAST)
         x = now + np.clip(x - now, -AHEAD, AHEAD)
-        free = Aim(None, aim.boxes, aim.margins)
-        return arm.improve(x, tips, free, 2)
+        return arm.improve(x, tips, Aim(None, aim.boxes, aim.margins), 2)
 
     # -- Way points ------------------------------------------------------------------
 
     def _way_point(
-        self, arm: Arm, hand: str, act: Act, view: View, now: Array
+        self, hand: str, act: Act, view: View, now: Array
     ) -> tuple[Array, float] | None:
         """Return where the tip goes, and how near the object; None: nowhere."""
-        tip = arm.hand(now, act.tips).tip
+        tip = self.arms[hand].hand(now, act.tips).tip
         if isinstance(act.goal, Push):
             return self._push(act, act.goal, view, tip)
         fingers = [f in self.env.agent.hands[hand] for f in self.env.agent.fingers]
-        return self._touch(act, view, tip, view.touched(fingers, act.index))
-
-    def _touch(
-        self, act: Act, view: View, tip: Array, touched: bool
-    ) -> tuple[Array, float] | None:
-        if touched:
+        if view.touched(fingers, act.index):
             return None
         place, top = view.place(act.index), view.top(act.index)
         if act.phase == 0 and np.linalg.norm((tip - place)[:2]) > NEAR:
@@ -480,50 +450,37 @@ class Scripted:
         for _ in range(view.stage):
             goal = goal.b if isinstance(goal, Then) else goal
         goals = acts_in(goal.a if isinstance(goal, Then) else goal)
-        hands = list(self.arms)
         rated = {
             (k, hand): self._rate(view, each, hand)
             for k, each in enumerate(goals)
-            for hand in hands
+            for hand in self.arms
             if getattr(each, "hand", None) in (None, hand)
         }
         ways = [
-            way
-            for way in itertools.permutations(hands, len(goals))
-            if all(pair in rated for pair in enumerate(way))
+            {hand: rated[k, hand] for k, hand in enumerate(way)}
+            for way in itertools.permutations(self.arms, len(goals))
+            if rated.keys() >= set(enumerate(way))
         ]
-        best = min(
-            ways, key=lambda way: sum(rated[pair].miss for pair in enumerate(way))
-        )
-        return {hand: rated[k, hand] for k, hand in enumerate(best)}
+        return min(ways, key=lambda way: sum(act.miss for act in way.values()))
 
     def _rate(self, view: View, goal: Touch | Push, hand: str) -> Act:
         """Return how a hand would do something: with the fingers that reach it best."""
-        arm, index = self.arms[hand], view.index(goal)
-        found: list[Act] = []
+        arm, found = self.arms[hand], list[Act]()
         for tips in arm.tips:
-            x, miss = self._try(view, goal, arm, index, tips)
-            found.append(Act(goal, index, tips, x, miss))
-            if miss < 0.004:
+            found.append(self._try(view, goal, arm, tips))
+            if found[-1].miss < 0.004:
                 break
         best = min(found, key=lambda act: act.miss)
-        best.miss += 0.05 * max(0.0, -arm.side * view.place(index)[1])  # the other side
+        y = view.place(best.index)[1]
+        best.miss += 0.05 * max(0.0, -arm.side * y)  # the other side
         return best
 
-    def _try(
-        self,
-        view: View,
-        goal: Touch | Push,
-        arm: Arm,
-        index: int,
-        tips: tuple[int, ...],
-    ) -> tuple[Array, float]:
-        """Return numbers over the object, and how far all way points are missed [m]."""
+    def _try(self, view: View, goal: Touch | Push, arm: Arm, tips: Tips) -> Act:
+        """Return how it would be done with these fingers, from over the object on."""
+        index, push = view.index(goal), _way(goal)
         place, over = view.place(index), view.top(index) + OVER
-        push = None
         low = np.append(place[:2], over - OVER + 0.009)
-        if isinstance(goal, Push):
-            push = np.array(DIRECTIONS[goal.direction])
+        if push is not None:
             low = np.append((place - BEHIND * push)[:2], LOW)
         aim = view.aim(low, [index], push=push)
         x = arm.search(tips, aim)
@@ -534,7 +491,7 @@ class Scripted:
         if isinstance(goal, Push):
             aim = self._at_end(view, goal, index)
             miss += arm.miss(arm.improve(x, tips, aim, 12), tips, aim)
-        return high, miss
+        return Act(goal, index, tips, high, miss)
 
     def _at_end(self, view: View, goal: Push, index: int) -> Aim:
         """Return the aim of a hand that has pushed something as far as it shall be."""
@@ -542,6 +499,11 @@ class Scripted:
         boxes[index, :2] = (view.start(index) + goal.distance * push)[:2]
         tip = np.append((boxes[index, :3] - 0.027 * push)[:2], LOW)
         return Aim(tip, boxes, view.aim(tip, [index]).margins, push)
+
+
+def _way(goal: Touch | Push) -> Array | None:
+    """Return the direction [3] in which a goal pushes; None: it does not."""
+    return np.array(DIRECTIONS[goal.direction]) if isinstance(goal, Push) else None
 
 
 class View:

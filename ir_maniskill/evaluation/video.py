@@ -388,7 +388,7 @@ def write_video(
         total: How many snapshots to expect, for the progress bar.
 
     Raises:
-        ValueError: Of another name, or where there is nothing to show.
+        ValueError: Of another name.
     """
     check_name(path)
     rate = CONTROL_FREQ * speed
@@ -404,10 +404,6 @@ def write_video(
     write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
     with replacing(path) as aside:
         write(aside, frames(), rate)
-        if count == 0:
-            raise ValueError(
-                f"video: got no frames for {path}, expected at least one episode"
-            )
     return count
 
 
@@ -434,7 +430,7 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
             writer.append_data(frame)
             written += 1
     # ffmpeg says nothing of a disk that was full; a film that is cut has fewer frames.
-    if written and imageio_ffmpeg.count_frames_and_secs(str(path))[0] != written:
+    if imageio_ffmpeg.count_frames_and_secs(str(path))[0] != written:
         raise OSError(errno.EIO, "ffmpeg did not write all frames")
 
 
@@ -442,8 +438,6 @@ def _write_gif(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
     """Write half the size, with one palette for all frames, to stay small."""
     size, smooth = (SIZE[0] // 2, SIZE[1] // 2), Image.Resampling.LANCZOS
     images = [Image.fromarray(frame).resize(size, smooth) for frame in frames]
-    if not images:
-        return
     some = [
         np.asarray(image) for image in (images[0], images[len(images) // 2], images[-1])
     ]

@@ -4,13 +4,12 @@
 """
 
 from ir_maniskill.language.draw import Allows, Thing, draw, things
-from ir_maniskill.language.grammar import SentenceError, count, parse, say
+from ir_maniskill.language.grammar import SentenceError, parse, say
 from ir_maniskill.language.splits import (
     HELD_OBJECTS,
     HELD_PAIRS,
     KINDS,
     SPLITS,
-    counts,
     handwritten,
     kind_of,
     split_of,
@@ -25,8 +24,6 @@ __all__ = [
     "Allows",
     "SentenceError",
     "Thing",
-    "count",
-    "counts",
     "draw",
     "handwritten",
     "kind_of",

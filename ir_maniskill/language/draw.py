@@ -1,7 +1,7 @@
 """Drawing: a goal that is true of a scene, for training or for a split held out of it.
 
-Objects are those of one scene; sets of them are the bits of an integer. Lengths are
-those of a scene at NAO's scale [m].
+Objects are those of one scene, by their places in it. Lengths are those of a scene at
+NAO's scale [m].
 """
 
 from __future__ import annotations
@@ -96,14 +96,14 @@ class _Scene:
         self.things = scene
         self.allows = allows
         self.split = split if split in ("objects", "pairs") else "train"
-        self.groups: dict[Name, int] = {}  # whom each description fits
+        self.groups: dict[Name, list[int]] = {}  # whom each description fits
         for index, (color, shape, _, _) in enumerate(scene):
             for name in ((color, shape), (color, None), (None, shape), (None, None)):
-                self.groups[name] = self.groups.get(name, 0) | 1 << index
+                self.groups.setdefault(name, []).append(index)
         self.plain: list[Found] = [
-            (name, None, group.bit_length() - 1)
+            (name, None, group[0])
             for name, group in self.groups.items()
-            if not group & (group - 1) and name != (None, None)
+            if len(group) == 1 and name != (None, None)
         ]
         self.known = [  # what training may name beside what it acts on
             (name, index)
@@ -139,30 +139,29 @@ class _Scene:
     def _extreme(self, relation: str) -> Iterator[Found]:
         axis, sign = EXTREMES[relation]
         far = [sign * (thing.x, thing.y)[axis] for thing in self.things]
-        order = sorted(range(len(far)), key=far.__getitem__, reverse=True)
         for name, group in self.groups.items():
-            first, second, *_ = [i for i in order if group >> i & 1] + [-1, -1]
-            if second >= 0 and far[first] - far[second] > MARGIN:
+            first, *others = sorted(group, key=far.__getitem__, reverse=True)
+            if others and far[first] - far[others[0]] > MARGIN:
                 yield name, relation, first
 
     def _beside(self, relation: str, landmark: Name, at: int) -> Iterator[Found]:
         sure, perhaps = self._side(relation, at)
         for name, group in self.groups.items():
-            fits = group & perhaps
-            if not fits or fits & (fits - 1) or not fits & sure:
+            fits = [index for index in group if index in perhaps]
+            if len(fits) != 1 or fits[0] not in sure:
                 continue
-            if relation != "other_than" or group >> at & 1:
-                yield name, (relation, landmark), fits.bit_length() - 1
+            if relation != "other_than" or at in group:
+                yield name, (relation, landmark), fits[0]
 
-    def _side(self, relation: str, at: int) -> tuple[int, int]:
+    def _side(self, relation: str, at: int) -> tuple[set[int], set[int]]:
         """Return who is surely on a side of an object, and who perhaps."""
-        others = (1 << len(self.things)) - 1 & ~(1 << at)
+        others = set(range(len(self.things))) - {at}
         if relation == "other_than":
             return others, others
         sign = 1 if relation == "left_of" else -1
-        beyond = [sign * (thing.y - self.things[at].y) for thing in self.things]
-        sure = sum(1 << i for i, d in enumerate(beyond) if d > MARGIN)
-        return sure, others & sum(1 << i for i, d in enumerate(beyond) if d > -MARGIN)
+        beyond = {i: sign * (self.things[i].y - self.things[at].y) for i in others}
+        sure = {i for i in others if beyond[i] > MARGIN}
+        return sure, {i for i in others if beyond[i] > -MARGIN}
 
 
 def draw(

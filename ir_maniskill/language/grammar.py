@@ -8,7 +8,6 @@ word, so that a sentence with two meanings would be found out.
 from __future__ import annotations
 
 import json
-import math
 import re
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -207,20 +206,14 @@ def _choices(symbol: str, value: Any, mark: str) -> tuple[tuple[Phrase, Slots], 
     return tuple(
         (phrase, slots)
         for slots in ([{}] if symbol in FILLERS else _take(symbol, value))
-        if all(_ways(SYMBOLS.get(n, n), part, SAID) for n, part in slots.items())
+        if all(_sayable(SYMBOLS.get(n, n), part) for n, part in slots.items())
         for phrase in _SAYING.get((symbol, mark, frozenset(slots)), ())
         if phrase.key in (None, key)
     )
 
 
-@lru_cache(10_000)
-def _ways(symbol: str, value: Any, marks: tuple[str, ...]) -> int:
-    """Return in how many ways a symbol can say a value."""
-    return sum(
-        math.prod(_ways(SYMBOLS.get(n, n), slots.get(n), marks) for n in phrase.slots)
-        for mark in marks
-        for phrase, slots in _choices(symbol, value, mark)
-    )
+def _sayable(symbol: str, value: Any) -> bool:
+    return any(_choices(symbol, value, mark) for mark in SAID)
 
 
 def _say(symbol: str, value: Any, rng: Random, wording: bool) -> tuple[str, bool]:
@@ -261,12 +254,6 @@ def say(goal: Goal, rng: Random, wording: bool = False) -> str:
         text, new = _say("sentence", goal, rng, wording)
         if new == wording:
             return text[0].upper() + text[1:]
-
-
-def count(goal: Goal, wording: bool = False) -> int:
-    """Return how many sentences `say` has for a goal."""
-    trained = _ways("sentence", goal, TRAIN)
-    return _ways("sentence", goal, SAID) - trained if wording else trained
 
 
 # -- Reading ---------------------------------------------------------------------------

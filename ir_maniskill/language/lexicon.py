@@ -11,6 +11,7 @@ numbers of a vector.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from difflib import get_close_matches
 from functools import cache, cached_property, lru_cache
 from importlib import resources
 from pathlib import Path
@@ -31,6 +32,8 @@ THRESHOLD = 0.4
 """How near a word must be to be read as another."""
 TEMPERATURE = 0.03
 """Of the softmax that mixes."""
+ALIKE = 0.75
+"""How alike the letters of a mistyped word must be, by `difflib`'s ratio."""
 
 
 class Lexicon:
@@ -111,23 +114,17 @@ class Lexicon:
         return names, known, likeness[-CROWD:].mean(axis=0) / 2
 
     def _mistyped(self, word: str) -> dict[str, float]:
-        """Return the known words that fewest letters tell from a word of none."""
-        most = min(2, (len(word) - 1) // 3)  # 1 from 4 letters on, 2 from 7 on
-        edits = {
-            known: edit_distance(word, known)
-            for known in self.vocabulary[2:]
-            if len(known) > (2 if known in self._content else 3)
-            and abs(len(known) - len(word)) <= most
-        }
-        fewest = min(edits.values(), default=9)
-        nearest = [k for k, count in edits.items() if count == fewest <= most]
-        return {known: 1 / len(nearest) for known in nearest}
+        """Return the known word that a word of none is most alike in its letters."""
+        if len(word) < 4:  # three letters could be anything
+            return {}
+        known = [
+            k for k in self.vocabulary[2:] if len(k) > (2 if k in self._content else 3)
+        ]
+        return dict.fromkeys(get_close_matches(word, known, n=1, cutoff=ALIKE), 1.0)
 
 
-@cache
-def lexicon(vocabulary: tuple[str, ...]) -> Lexicon:
-    """Return the lexicon of a vocabulary, the same one for all who ask."""
-    return Lexicon(vocabulary)
+lexicon = cache(Lexicon)
+"""Returns the lexicon of a vocabulary, the same one for all who ask."""
 
 
 @cache
@@ -148,21 +145,3 @@ def word_vectors() -> tuple[dict[str, int], np.ndarray]:
 
 def _file(name: str) -> Path:
     return Path(str(resources.files("ir_maniskill.assets") / "language" / name))
-
-
-def edit_distance(a: str, b: str) -> int:
-    """Return how many letters to add, drop, change, or swap with the next make b of a.
-
-    Optimal string alignment, one row of the table after the other.
-    """
-    before: list[int] = []
-    row = list(range(len(b) + 1))
-    for i, x in enumerate(a):
-        above, row = row, [i + 1]
-        for j, y in enumerate(b):
-            cost = min(above[j] + (x != y), above[j + 1] + 1, row[j] + 1)
-            if i and j and (x, a[i - 1]) == (b[j - 1], y):
-                cost = min(cost, before[j - 1] + 1)
-            row.append(cost)
-        before = above
-    return row[-1]

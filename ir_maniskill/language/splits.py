@@ -1,20 +1,14 @@
-"""Splits: what training never says, which words there are, and how many sentences.
+"""Splits: what training never says, and which words there are.
 
 An object is described by a `Name`, its color and shape, either of which may be None.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
 from functools import cache
-from itertools import product
 
 from ir_maniskill.goals import (
-    COLORS,
-    EXTREMES,
     FIXED,
-    RELATIONS,
-    SHAPES,
     Avoid,
     Both,
     Goal,
@@ -25,7 +19,7 @@ from ir_maniskill.goals import (
     Then,
     Touch,
 )
-from ir_maniskill.language.grammar import count, load_json, parse, words_by_mark
+from ir_maniskill.language.grammar import load_json, parse, words_by_mark
 from ir_maniskill.language.tokens import words_of
 
 Name = tuple[str | None, str | None]
@@ -82,7 +76,7 @@ def split_of(goal: Goal) -> str | None:
     `draw` also minds what a "red one" is in its scene.
     """
     acts = [(verb, (ref.color, ref.shape)) for verb, ref in acts_of(goal)]
-    named = {(r.color, r.shape) for r in _refs(goal)}
+    named = {(r.color, r.shape) for r in refs_of(goal)}
     new = {status(verb, *name) for verb, name in acts} - {"train"}
     beside = named - {name for _, name in acts}
     if beside & HELD_OBJECTS or len(new) > 1:
@@ -117,13 +111,13 @@ def acts_of(goal: Goal) -> list[tuple[str, Ref]]:
     return [found for part in goal.parts for found in acts_of(part)]
 
 
-def _refs(goal: Goal) -> list[Ref]:
+def refs_of(goal: Goal) -> list[Ref]:
     """Return the references in a goal, and those in their relations."""
     inner = [r.where.ref for r in goal.refs if isinstance(r.where, Relation)]
     return [*goal.refs, *inner]
 
 
-# -- Words and sentences ---------------------------------------------------------------
+# -- Words -----------------------------------------------------------------------------
 
 
 @cache
@@ -146,58 +140,3 @@ def words(split: str = "train") -> tuple[str, ...]:
         return words_by_mark("train")
     texts = words_of(instruction.text for instruction in handwritten())
     return tuple(dict.fromkeys((*words_by_mark("train", "wording"), *texts)))
-
-
-def counts(
-    split: str = "train", kinds: Collection[str] = KINDS
-) -> dict[str, tuple[int, int]]:
-    """Return how many goals and sentences a split has, by kind.
-
-    Goals count that can be said; a few of them are true of no scene.
-    """
-    new = split if split in ("objects", "pairs") else "train"
-    sizes = {
-        kind: [count(g, split == "wording") for g in _goals(kind) if split_of(g) == new]
-        for kind in kinds
-    }
-    return {kind: (len(found), sum(found)) for kind, found in sizes.items()}
-
-
-NAMES: tuple[Name, ...] = (*product(COLORS, (None, *SHAPES)), *product([None], SHAPES))
-"""All descriptions without a relation."""
-
-
-def _covers(name: Name, other: Name) -> bool:
-    """Return whether all that fits the other description fits this one."""
-    return all(a in (None, b) for a, b in zip(name, other, strict=True))
-
-
-def _goals(kind: str) -> Iterator[Goal]:
-    """Yield all goals of a kind, less those that name one object twice."""
-    every = [verb for group in VERBS.values() for verb in group]
-    apart = [
-        (name, other)
-        for name, other in product(NAMES, NAMES)
-        if not (_covers(name, other) or _covers(other, name))
-    ]
-    if kind in VERBS:
-        yield from (act(*a) for a in product(VERBS[kind], NAMES) if can(*a))
-    elif kind == "where":
-        for verb, (name, other) in product(every, apart):
-            if can(verb, name):
-                yield Both(act(verb, name), Avoid(Ref(*other)))
-        for verb, name in product(every, (*NAMES, (None, None))):
-            if can(verb, name):
-                yield from (act(verb, name, where) for where in _wheres(name))
-    else:
-        both = kind == "both"
-        for (v, w), (n, m) in product(TEAMS if both else product(every, every), apart):
-            if can(v, n) and can(w, m):
-                yield (Both if both else Then)(act(v, n), act(w, m))
-
-
-def _wheres(name: Name) -> Iterator[str | Relation]:
-    yield from EXTREMES
-    for kind, other in product(RELATIONS, NAMES):
-        if not _covers(other, name):
-            yield Relation(kind, Ref(*other))

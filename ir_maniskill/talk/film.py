@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ir_maniskill.environment.touch_env import CONTROL_FREQ
 from ir_maniskill.evaluation import video
-from ir_maniskill.talk.session import Choice, Session
+from ir_maniskill.talk.session import Session
 
 LONGEST = 180
 """How much of what was seen is kept, the end [s]."""
@@ -26,24 +26,16 @@ LONGEST = 180
 class Moment:
     """One step, as a film needs it."""
 
-    choice: Choice
-    """What was played."""
+    task: str
+    """Id of the task."""
+    robot: Any
+    """Who played."""
     state: dict[str, Any]
     """The simulator's state."""
     slot: Tensor
     """Which body is in each slot of the table [1, C]."""
-    pictures: dict[str, np.ndarray]
-    """What the policy's cameras saw."""
-    sentence: str
-    """What was typed."""
-    lights: tuple[str, ...]
-    """What each of the F fingers touches, as `Session.lights` says."""
-    step: int
-    """Steps since the sentence was said."""
-    success: bool
-    """Whether the goal held."""
-    reward: float
-    """Sum of the rewards since then."""
+    shot: video.Snapshot
+    """The frame, but for the human view, and of its history this step alone."""
 
 
 class Film:
@@ -52,25 +44,27 @@ class Film:
     def __init__(self) -> None:
         """Start with nothing."""
         self._moments: list[Moment] = []
-        self._robots: dict[str, Any] = {}
 
     def add(self, session: Session) -> None:
         """Keep the step that was just made."""
-        lights = session.lights().values()
+        touching = [s for hand in session.lights().values() for s in hand.values()]
+        wrong = tuple(state == "wrong" for state in touching)
+        shot = video.Snapshot(
+            view=np.empty(0),
+            cameras={name: seen.copy() for name, seen in session.pictures().items()},
+            instruction=session.reading.heard,
+            hands=session.env.agent.hands,
+            right=tuple(state in ("right", "touch") for state in touching),
+            wrong=wrong,
+            step=session.score.steps,
+            total_steps=0,
+            score=session.score.reward,
+            history=((session.score.success, any(wrong)),),
+        )
         state = session.env.get_state_dict()
         del state["task"]  # a film is not judged
-        moment = Moment(
-            session.choice,
-            state,
-            session.env.table.slot,
-            {name: seen.copy() for name, seen in session.pictures().items()},
-            session.reading.heard,
-            tuple(state for hand in lights for state in hand.values()),
-            session.score.steps,
-            session.score.success,
-            session.score.reward,
-        )
-        self._robots[session.choice.robot] = session.env.agent
+        table, robot = session.env.table, session.env.agent
+        moment = Moment(session.choice.task, robot, state, table.slot, shot)
         self._moments.append(moment)
         del self._moments[: -LONGEST * CONTROL_FREQ]
 
@@ -84,39 +78,33 @@ class Film:
         with ExitStack() as opened:
             stages: dict[str, Any] = {}
             for take in self._takes():
-                task, robot = take[0].choice.task, self._robots[take[0].choice.robot]
-                key = f"{task} {robot.uid}"
+                key = f"{take[0].task} {take[0].robot.uid}"
                 if key not in stages:
-                    stage = closing(video.stage(task, robot))
+                    stage = closing(video.stage(take[0].task, take[0].robot))
                     stages[key] = opened.enter_context(stage)
-                yield from _shots(take, stages[key], robot.hands)
+                yield from _shots(take, stages[key])
 
     def _takes(self) -> Iterator[list[Moment]]:
         """Return the moments from one sentence to the next."""
         take: list[Moment] = []
         for moment in self._moments:
-            if take and moment.step <= take[-1].step:
+            if take and moment.shot.step <= take[-1].shot.step:
                 yield take
                 take = []
             take.append(moment)
         yield take
 
 
-def _shots(take: list[Moment], stage: Any, hands: Any) -> Iterator[video.Snapshot]:
+def _shots(take: list[Moment], stage: Any) -> Iterator[video.Snapshot]:
     history: tuple[tuple[bool, bool], ...] = ()
     for moment in take:
         stage.unwrapped.table.put(slice(None), moment.slot)
         stage.unwrapped.set_state_dict(moment.state)
-        history += ((moment.success, "wrong" in moment.lights),)
-        yield video.Snapshot(
+        history += moment.shot.history
+        yield replace(
+            moment.shot,
             view=stage.render().cpu().numpy()[0],
-            cameras=moment.pictures,
-            instruction=moment.sentence,
-            hands=hands,
-            right=tuple(state in ("right", "touch") for state in moment.lights),
-            wrong=tuple(state == "wrong" for state in moment.lights),
             step=len(history),
             total_steps=len(take),
-            score=moment.reward,
             history=history,
         )

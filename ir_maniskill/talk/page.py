@@ -160,13 +160,9 @@ class Page:
     def _add_choice(self) -> None:
         gui, session = self.server.gui, self.session
         with gui.add_folder("The paper's experiments"):
-            runs = gui.add_button_group("Run", ("I", "II", "III"))
+            runs = gui.add_button_group("Run", tuple(PAPER))
             self._run = gui.add_html("")
-        runs.on_click(
-            lambda _: self._wish(
-                session.experiment, PAPER[("I", "II", "III").index(runs.value)]
-            )
-        )
+        runs.on_click(lambda _: self._wish(session.experiment, PAPER[runs.value]))
         with gui.add_folder("Choose"):
             self._choices: dict[str, Any] = {
                 "task": gui.add_dropdown("Task", catalog.available()),

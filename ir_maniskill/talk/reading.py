@@ -5,7 +5,6 @@ from __future__ import annotations
 import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
 
 from ir_maniskill.environment.senses import TEXT_BYTES
 from ir_maniskill.goals import (
@@ -27,8 +26,6 @@ from ir_maniskill.snapshot import Snapshot
 
 LONGEST = TEXT_BYTES - 8
 """Of a sentence no more is heard [byte]."""
-
-
 EXPECTED = 7
 """How many of the words that were expected are told at most, beyond the first."""
 
@@ -85,11 +82,10 @@ def read(
         return Reading(heard, heard, None, _why(error), (), _new(heard, vocabulary))
     said = same[0].text if same else heard
     if not same and _new(heard, vocabulary):
-        alike = (i.text for i in known if _means(i.goal, scene) == meant)
+        alike = (i.text for i in known if _means(i.goal, meant, scene))
         said = next(alike, heard)
-    objects = tuple(dict.fromkeys(_objects(meant)))
-    unknown = _new(said, vocabulary)
-    return Reading(heard, said, goal, in_words(meant, names(scene)), objects, unknown)
+    objects = tuple(dict.fromkeys(_place(ref, scene) for ref in meant.refs))
+    return Reading(heard, said, goal, in_words(meant), objects, _new(said, vocabulary))
 
 
 def _words(text: str) -> list[str]:
@@ -113,47 +109,37 @@ def _why(error: GoalError) -> str:
 # -- Meaning ---------------------------------------------------------------------------
 
 
-def grounded(goal: Goal, scene: Snapshot) -> tuple[Any, ...]:
-    """Return a goal's kind and fields, each reference as the place of its object.
+def grounded(goal: Goal, scene: Snapshot) -> Goal:
+    """Return a goal whose references say color and shape of the objects they fit.
 
     Raises:
         GoalError: A reference does not fit exactly one object.
     """
-    values = (getattr(goal, field.name) for field in fields(goal))
-    return type(goal), *(_grounded(value, scene) for value in values)
+    plain: dict[str, Goal | Ref] = {}
+    for name in (field.name for field in fields(goal)):
+        value = getattr(goal, name)
+        if isinstance(value, Goal):
+            plain[name] = grounded(value, scene)
+        elif isinstance(value, Ref):
+            color, shape = names(scene)[_place(value, scene)].split()
+            plain[name] = Ref(color, shape)
+    return replace(goal, **plain)
 
 
-def _grounded(value: Any, scene: Snapshot) -> Any:
-    if isinstance(value, Goal):
-        return grounded(value, scene)
-    if not isinstance(value, Ref):
-        return value
-    fits = value.resolve(scene)[0].nonzero().flatten().tolist()
+def _place(ref: Ref, scene: Snapshot) -> int:
+    """Return the place of the object that a reference fits among the scene's."""
+    fits = ref.resolve(scene)[0].nonzero().flatten().tolist()
     if len(fits) != 1:
         here = ", ".join(n for n in names(scene) if n)
-        raise GoalError(f"{_spoken(value)} fits {len(fits)} objects here, of: {here}")
-    return _Object(fits[0])
+        raise GoalError(f"{_spoken(ref)} fits {len(fits)} objects here, of: {here}")
+    return fits[0]
 
 
-class _Object(int):
-    """Place of an object among those of a scene."""
-
-
-def _means(goal: Goal, scene: Snapshot) -> tuple[Any, ...] | None:
+def _means(goal: Goal, meant: Goal, scene: Snapshot) -> bool:
     try:
-        return grounded(goal, scene)
+        return grounded(goal, scene) == meant
     except GoalError:
-        return None
-
-
-def _objects(meant: tuple[Any, ...]) -> list[int]:
-    found: list[int] = []
-    for value in meant:
-        if isinstance(value, tuple):
-            found += _objects(value)
-        elif isinstance(value, _Object):
-            found.append(int(value))
-    return found
+        return False
 
 
 def names(scene: Snapshot) -> list[str]:
@@ -163,22 +149,21 @@ def names(scene: Snapshot) -> list[str]:
     return [f"{colors[c]} {SHAPES[s]}" if c >= 0 else "" for c, s in pairs]
 
 
-def in_words(meant: tuple[Any, ...], names: Sequence[str]) -> str:
-    """Return a grounded goal in plain words, as short as its kind allows."""
-    kind, *values = meant
-    said = [in_words(v, names) if isinstance(v, tuple) else v for v in values]
-    said = [f"the {names[v]}" if isinstance(v, _Object) else v for v in said]
-    if kind is Touch:
-        hand = f" with the {said[1]} hand" if said[1] else ""
-        return f"touch {said[0]}{hand}"
-    if kind is Push:
-        way = "away" if said[1] == "away" else f"to the {said[1]}"
-        return f"push {said[0]} {way}"
-    if kind is Avoid:
-        return f"leave {said[0]} alone"
-    if kind in (Both, Then):
-        return f"{said[0]}{' and ' if kind is Both else ', then '}{said[1]}"
-    return f"{kind.__name__.lower()} {', '.join(map(str, said))}"
+def in_words(goal: Goal) -> str:
+    """Return a goal in plain words, as short as its kind allows."""
+    match goal:
+        case Touch(ref, hand):
+            return f"touch {_spoken(ref)}" + (f" with the {hand} hand" if hand else "")
+        case Push(ref, way):
+            return f"push {_spoken(ref)} {'away' if way == 'away' else f'to the {way}'}"
+        case Avoid(ref):
+            return f"leave {_spoken(ref)} alone"
+        case Both(a, b):
+            return f"{in_words(a)} and {in_words(b)}"
+        case Then(a, b):
+            return f"{in_words(a)}, then {in_words(b)}"
+    objects = ", ".join(map(_spoken, goal.refs))
+    return f"{type(goal).__name__.lower()} {objects}"
 
 
 def _spoken(ref: Ref) -> str:

@@ -33,8 +33,12 @@ from ir_maniskill.snapshot import Snapshot
 from ir_maniskill.talk.players import RANDOM, RandomMotion, fitting, load, shortened
 from ir_maniskill.talk.reading import Reading, clean, names, read
 
-PAPER = ("NaoTouchCubeSingle-v1", "NaoTouchCubeMulti-v1", "NaoTouchCubeTriangle-v1")
-"""The paper's experiments I to III."""
+PAPER = {
+    "I": "NaoTouchCubeSingle-v1",
+    "II": "NaoTouchCubeMulti-v1",
+    "III": "NaoTouchCubeTriangle-v1",
+}
+"""The paper's experiments."""
 APART = 1.25 * OBJECT_SIZE
 """How near an object may be dragged to another one, between centers [m]."""
 LASTS = 2
@@ -78,8 +82,6 @@ class Score:
 class Run:
     """A run of an experiment: its sentences one after the other."""
 
-    task: str
-    """Id of the experiment."""
     sentences: tuple[str, ...]
     """What is said, in order."""
     reached: tuple[bool, ...] = ()
@@ -164,17 +166,16 @@ class Session:
             require_choice("task", choice.task, catalog.available())
             require_choice("robot", choice.robot, robots())
             players = self.players(choice)
-            if "policy" not in wanted:
-                best = RANDOM if self._random else players[0]
-                choice = replace(choice, policy=best)
-            require_choice("policy", choice.policy, players)
+            if "policy" in wanted:
+                require_choice("policy", choice.policy, players)
+                chance = choice.policy == RANDOM
+            else:
+                chance = self._random
+                choice = replace(choice, policy=RANDOM if chance else players[0])
             self._enter(choice)
+            self._random = chance
         except ValueError as error:
             self.note = str(error)
-        else:
-            self._random = (
-                choice.policy == RANDOM if "policy" in wanted else self._random
-            )
 
     def players(self, choice: Choice | None = None) -> list[str]:
         """Return the names of what can move the robot in the task, the best first."""
@@ -182,39 +183,34 @@ class Session:
         return fitting(choice.task, choice.robot, self._checkpoint)
 
     def _enter(self, choice: Choice) -> None:
-        self.env, self._policy = self._stage(choice)
-        self.choice = choice
-        self.new_scene()
-
-    def _stage(self, choice: Choice) -> tuple[Any, Policy | RandomMotion]:
-        """Return the env of a choice, which is made once, and what plays there."""
+        """Go to the env of a choice, which is made once."""
         policy = None if choice.policy == RANDOM else load(choice.policy)
         kwargs = (policy or RandomMotion).env_kwargs | {"robot_uids": choice.robot}
         key = f"{choice.task} {kwargs}"
         if key not in self._envs:
             # Without its wrappers: what is live has no time limit.
             self._envs[key] = gym.make(choice.task, num_envs=1, **kwargs).unwrapped
-        env = self._envs[key]
-        return env, policy or RandomMotion(len(env.agent.joints))
+        self.env = self._envs[key]
+        self._policy = policy or RandomMotion(len(self.env.agent.joints))
+        self.choice = choice
+        self.new_scene()
 
     # -- Scenes ------------------------------------------------------------------------
 
     def new_scene(self) -> None:
         """Lay the objects out anew, with one of the task's sentences."""
-        self.run = None
         self.seed += 1
         self._begin()
         self._say(self.env.get_language_instruction()[0])
 
     def reset(self) -> None:
         """Begin again in the same scene, with the same sentence."""
-        self.run = None
         heard = self.reading.heard
         self._begin()
         self._say(heard)
 
     def _begin(self) -> None:
-        self.note = ""
+        self.run, self.note = None, ""
         self.held: tuple[int, float, float] | None = None
         self.obs, _ = self.env.reset(seed=self.seed)
         self._policy.reset()
@@ -363,7 +359,7 @@ class Session:
     def experiment(self, task: str) -> None:
         """Run an experiment: each of its sentences once, in scenes of their own."""
         self.choose(task=task, robot=Nao.uid, policy=task)
-        self.run = Run(task, tuple(i.text for i in self._known()))
+        self.run = Run(tuple(i.text for i in self._known()))
         self._say(self.run.sentences[0])
 
     def _go_on(self) -> None:
@@ -408,16 +404,15 @@ class Session:
 
     def lights(self) -> dict[str, dict[str, str]]:
         """Return what each finger of each hand touches: "right", "wrong" or ""."""
-        verdict, states = self.env.verdict, []
+        verdict = self.env.verdict
         touching = self.scene.contact[0].any(dim=1)
-        for right, wrong, any_ in zip(
-            verdict.right[0], verdict.wrong[0], touching, strict=True
-        ):
-            state = "wrong" if wrong else "right" if right else ""
-            states.append(state if self.reading.goal else "touch" * bool(any_))
-        left = iter(states)
+        found = zip(verdict.right[0], verdict.wrong[0], touching, strict=True)
+        if self.reading.goal is None:
+            states = ("touch" if any_ else "" for _, _, any_ in found)
+        else:
+            states = ("wrong" if w else "right" if r else "" for r, w, _ in found)
         hands = self.env.agent.hands.items()
-        return {hand: {finger: next(left) for finger in mine} for hand, mine in hands}
+        return {hand: {f: next(states) for f in fingers} for hand, fingers in hands}
 
 
 def _visible(entity: sapien.Entity) -> bool:

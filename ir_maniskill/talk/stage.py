@@ -41,7 +41,6 @@ class Stage:
         self._robot = ""
         self._bodies: dict[str, Any] = {}
         self._sent: dict[str, np.ndarray] = {}
-        self._marks: list[Any] = []
         self._lights: list[Any] = []
         self._rings: list[Any] = []
         self._things: dict[str, int] = {}
@@ -119,7 +118,7 @@ class Stage:
 
     def _add_marks(self, session: Session) -> None:
         """Bring a light for each finger and a ring for each object, not yet shown."""
-        for mark in self._marks:
+        for mark in (*self._lights, *self._rings):
             mark.remove()
         scale, add = session.env.agent.scale, self._server.scene.add_mesh_simple
         ball = trimesh.creation.icosphere(3, LIGHT * scale)
@@ -133,7 +132,6 @@ class Stage:
             add(f"/marks/{n}", ring.vertices, ring.faces, color=(255,) * 3, **looks)
             for n in range(len(session.names))
         ]
-        self._marks = [*self._lights, *self._rings]
 
     def move(self, session: Session, poses: np.ndarray) -> None:
         """Draw the bodies where they are: their poses [B, 7]."""

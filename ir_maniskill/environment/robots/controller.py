@@ -5,7 +5,6 @@ Legend: N envs, J joints.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -66,20 +65,13 @@ class TargetController(PDJointPosController):
 
         Args:
             targets: Positions in the order of `config.joint_names` [N, J] [rad].
-
-        Raises:
-            ValueError: They hold NaN (checked on the CPU only).
         """
         targets = targets.clamp(self.lower, self.upper)
         if self.scene.gpu_sim_enabled:
             # Of a batch ManiSkill takes the rows of the envs being reset alone.
             super().set_drive_targets(targets[self.scene._reset_mask])
         else:
-            angles = targets.tolist()[0]
-            if math.isnan(sum(angles)):
-                raise ValueError(
-                    f"joint targets: got {angles}, expected no NaN: look at the action"
-                )
+            (angles,) = targets.tolist()
             for joint, angle in zip(self._physx_joints, angles, strict=True):
                 joint.set_drive_target(angle)
         self._target_qpos = targets

@@ -79,7 +79,9 @@ class _Body:
         for part in link:
             place = frame @ _frame(part)
             if part.tag == "inertial":
-                self.inertials.append(_inertial(part).moved(place))
+                mass, inertia = urdf.mass_and_inertia(part)
+                body = facts.Inertial(mass, np.zeros(3), inertia)
+                self.inertials.append(body.moved(place))
             elif part.tag in ("visual", "collision"):
                 self.shapes.append(_move(part, place))
 
@@ -129,7 +131,9 @@ def _follow(
     name = joint.attrib["name"]
     if (model := ours.get(name)) is None:
         posture = facts.read_posture().get(name, 0.0)
-        return child, carrier, place @ _motion(joint, posture)
+        if posture:
+            place = place @ rotation_matrix(posture, urdf.axis(joint))
+        return child, carrier, place
     moved = urdf.get(model, "child", "link")
     bodies[moved] = _Body(_joint(joint, model, carrier, place))
     return child, moved, np.eye(4)
@@ -194,16 +198,11 @@ def _find_files(robot: Element, home: Path) -> None:
             element.set("filename", str(found))
     if any(missing.values()):
         kinds = {"meshes": missing["mesh"], "textures": missing["texture"]}
-        listed = (_listed(kind, names) for kind, names in kinds.items() if names)
+        listed = (f"missing {k}: {', '.join(n[:3])}" for k, n in kinds.items() if n)
         roots = (f"{key}={os.environ.get(key, '')}" for key in _ROOTS)
         raise RobotError(
             f"{'; '.join(listed)}; looked in {', '.join(roots)}, and above {home}"
         )
-
-
-def _listed(kind: str, names: list[str]) -> str:
-    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-    return f"missing {kind}: {', '.join(names[:3])}{more}"
 
 
 _ROOTS = {"ROS_PACKAGE_PATH": "", "GAZEBO_MODEL_PATH": "", "AMENT_PREFIX_PATH": "share"}
@@ -245,16 +244,6 @@ def _move(element: Element, frame: np.ndarray) -> Element:
     origin.set("xyz", _text(frame[:3, 3]))
     origin.set("rpy", _text(euler_from_matrix(frame, axes="sxyz")))
     return element
-
-
-def _motion(joint: Element, angle: float) -> np.ndarray:
-    return rotation_matrix(angle, urdf.axis(joint)) if angle else np.eye(4)
-
-
-def _inertial(element: Element) -> facts.Inertial:
-    """Return mass and inertia, as if the element's origin were that of the link."""
-    mass, inertia = urdf.mass_and_inertia(element)
-    return facts.Inertial(mass, np.zeros(3), inertia)
 
 
 def _inertial_of(bodies: list[facts.Inertial]) -> Element:

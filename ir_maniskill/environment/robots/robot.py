@@ -22,8 +22,8 @@ from mani_skill.agents.registration import REGISTERED_AGENTS
 from mani_skill.utils.structs import Actor
 from torch import Tensor
 
-from ir_maniskill.environment import contacts
 from ir_maniskill.environment.bodies import positions
+from ir_maniskill.environment.contacts import CpuTouchSensor, GpuTouchSensor
 from ir_maniskill.environment.robots.controller import TargetControllerConfig
 from ir_maniskill.environment.robots.loader import read_builder
 from ir_maniskill.environment.robots.urdf import RobotError, read_motors
@@ -251,9 +251,6 @@ class Robot(BaseAgent, ABC):
 
         Args:
             action: As the control mode asks, in the order of `joints` [N, J].
-
-        Raises:
-            ValueError: It leads to NaN (checked on the CPU only).
         """
         self.controller.set_action(action)
 
@@ -285,15 +282,14 @@ class Robot(BaseAgent, ABC):
             "target": self._normalize(self.controller.target),
         }
 
-    def touch_sensor(
-        self, objects: Sequence[Actor]
-    ) -> contacts.CpuTouchSensor | contacts.GpuTouchSensor:
+    def touch_sensor(self, objects: Sequence[Actor]) -> CpuTouchSensor | GpuTouchSensor:
         """Return a sensor of which finger touches which object [N, F, C].
 
         Args:
             objects: What the fingers may touch; anything else is not felt.
         """
-        return contacts.touch_sensor(self.scene, self.finger_links, objects)
+        kind = GpuTouchSensor if self.scene.gpu_sim_enabled else CpuTouchSensor
+        return kind(self.scene, self.finger_links, objects)
 
     def joint_velocity(self) -> Tensor:
         """Return joint velocities in the action's order [N, J] [rad/s]."""
