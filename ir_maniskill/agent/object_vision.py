@@ -129,12 +129,12 @@ class Finder(nn.Module):
         known, found = said, said
         layers = zip(self.queries, self.keys, self.values, self.joins, strict=True)
         for query, key, value, join in layers:
-            asked, *told = (
+            asked, keys, values = (
                 _heads(each)
                 for each in (query(known)[:, None], key(entries), value(entries))
             )
             mask = absent.to(asked.dtype).expand(-1, HEADS, -1, -1)
-            seen = functional.scaled_dot_product_attention(asked, *told, attn_mask=mask)
+            seen = functional.scaled_dot_product_attention(asked, keys, values, mask)
             found = join(torch.cat([seen.flatten(1), known], dim=1))
             known = torch.cat([said, found], dim=1)
         return found
