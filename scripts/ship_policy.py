@@ -33,19 +33,20 @@ def ship(run: Path, episodes: int, scenes: int) -> EvaluationReport:
 
     Args:
         run: Folder of the run.
-        episodes: Episodes for each sentence.
+        episodes: Episodes for each sentence; in all, where sentences are drawn.
         scenes: Scenes in which to give it every sentence, if there are several.
     """
     stored = checkpoint.read(run / "best.safetensors")
     agent, config, facts = checkpoint.load_agent(run / "best.safetensors")
     task, sentences = config.env_id, len(catalog.get(config.env_id).sentences)
+    spoken = sentences == 0  # there are thousands
     play: dict[str, Any] = {"frames": config.frames, "progress": True}
     play["seed"] = EVALUATION_SEED
     with closing(make_vec(task, 8, **config.env_kwargs(training=False))) as envs:
-        told = episodes * sentences
+        told = episodes * (1 if spoken else sentences)
         report = evaluate_policy(agent.policy, envs, episodes=told, **play)
         figures = {**report.as_dict(), "commit": _commit()}
-        if sentences > 1:
+        if sentences != 1:
             player = player_of(agent.policy, config.frames)
             same = same_scene(player, envs, scenes=scenes, seed=EVALUATION_SEED)[0]
             exclusive = same.exclusive.as_dict("exclusive")

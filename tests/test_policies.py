@@ -58,10 +58,12 @@ def test_a_policy_of_0_1_acts_as_it_did(path: Path) -> None:
 @pytest.mark.render
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_a_shipped_policy_does_what_it_is_told(path: Path) -> None:
-    agent, config, _ = load_agent(path)
+    agent, config, facts = load_agent(path)
+    told = facts["evaluation"]["overall"]
     score = play(agent.policy, config, episodes=6)
-    assert score.exclusive.value >= 5 / 6  # none sweeps up whatever there is
-    assert score.holding > 0.6
+    # None sweeps up whatever there is; one in six may fail, or two if it often does.
+    assert score.exclusive.value >= told["exclusive"] - 1 / 3
+    assert score.holding > told["holding"] - 0.3
 
 
 @pytest.mark.render
