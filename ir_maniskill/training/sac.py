@@ -392,7 +392,8 @@ class SAC(Algorithm):
         weights = [w for group in optimizer.param_groups for w in group["params"]]
         gradients = torch.autograd.grad(loss, weights, allow_unused=True)
         for weight, gradient in zip(weights, gradients, strict=True):
-            weight.grad = gradient
+            # Fused Adam reads a gradient as it lies in memory, channels last or not.
+            weight.grad = gradient if gradient is None else gradient.contiguous()
         nn.utils.clip_grad_norm_(weights, LONGEST)
         optimizer.step()
 
