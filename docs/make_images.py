@@ -49,9 +49,25 @@ FILMS = (
     "NaoTouchButtonMulti-v1",
     "NaoTouchButtonTriangle-v1",
     "NaoTouchButtonShuffled-v1",
+    "NaoInstruct-v1",
 )
 """The tasks of which there is a film."""
 SHUFFLED = "NaoTouchCubeShuffled-v1"
+SPOKEN = "NaoInstruct-v1"
+SCENE, TOLD = (
+    2_100_009,
+    (
+        "Touch the orange cube.",
+        "Use your left hand to touch the purple pyramid.",
+        "Tap the blue one with your right hand.",
+        "Touch the rightmost object.",
+        "Touch the cube that is not orange.",
+        "Touch the one that is left of the pyramid.",
+        "Put a finger on the violet thing please",
+        "Touch the green cube and the orange cube at the same time.",
+    ),
+)
+"""Seed of a scene, and what its film tells the policy there, one after the other."""
 FAILURE = (EVALUATION_SEED + 35, 2)
 """Seed and sentence of an episode in which the shipped policy touches a wrong cube."""
 
@@ -165,12 +181,16 @@ def save(make: Callable[[], Image.Image], path: Path) -> None:
 
 def film(task: str, path: Path) -> None:
     """Write a film of the shipped policy, told every sentence in the same scene."""
-    told = range(len(catalog.get(task).sentences))
-    write_video(path, chain.from_iterable(episode(task, i) for i in told))
+    told: Any = range(len(catalog.get(task).sentences))
+    seed = EVALUATION_SEED
+    if task == SPOKEN:
+        told, seed = TOLD, SCENE
+    shots = (episode(task, said, seed) for said in told)
+    write_video(path, chain.from_iterable(shots))
 
 
 def episode(
-    task: str, told: int, seed: int = EVALUATION_SEED, act: Any = None
+    task: str, told: int | str, seed: int = EVALUATION_SEED, act: Any = None
 ) -> Iterator[Snapshot]:
     """Play one episode with the shipped policy, or with `act` in its place."""
     policy = load_policy(task)

@@ -432,7 +432,7 @@ def test_in_a_browser_it_does_as_told(session, tmp_path):
         while visit.is_alive():
             live.keep_going(page, until=time.perf_counter() + 0.5)
     (seen,) = found  # else the visit failed, and its thread said why
-    assert seen["moved"] > 0.05 and seen["lights"] == {"right"}
+    assert seen["moved"] > 0.02 and seen["lights"] == {"right"}
     assert seen["dragged"] > 0.02
     assert "not understood" in seen["nonsense"] and "<i>twice</i>" in seen["nonsense"]
     assert all(
@@ -444,6 +444,7 @@ def test_in_a_browser_it_does_as_told(session, tmp_path):
 def visited(page, folder):
     """Visit the page as a person would, and return what was seen there."""
     session, seen = page.session, {}
+    start = session.poses()  # nothing moves before somebody looks
     with closing(Browser(page.address)) as browser:
         wait_for(lambda: "wrong touch" in browser.text())
 
@@ -455,7 +456,6 @@ def visited(page, folder):
             browser.press("Enter", 13, text="\r")
             wait_for(lambda: session.reading.heard == text)
 
-        start = session.poses()
         say(RED)
         wait_for(lambda: session.score.success)
         seen["lights"] = lit(session)
