@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import partial
 from numbers import Real
 from types import SimpleNamespace
@@ -31,7 +31,7 @@ import torch
 from torch import Tensor
 
 from ir_maniskill import checks
-from ir_maniskill.snapshot import Snapshot
+from ir_maniskill.snapshot import Lazy, Snapshot, later
 
 COLORS: dict[str, tuple[float, float, float]] = {
     "blue": (0.05, 0.16, 0.85),
@@ -157,9 +157,17 @@ class Ref:
 # -- Measures --------------------------------------------------------------------------
 
 
+def _left_out() -> Tensor:
+    """Return what stands for a field that was left out."""
+    return None  # type: ignore[return-value]
+
+
 @dataclass(frozen=True)
-class Measure:
-    """How far a goal is reached in N scenes, and what it allows."""
+class Measure(Lazy):
+    """How far a goal is reached in N scenes, and what it allows.
+
+    A field may be given as `later(function)`; what is left out comes later, too.
+    """
 
     holds: Tensor
     """Whether the goal is reached now [N] bool."""
@@ -168,33 +176,43 @@ class Measure:
     serves: Tensor
     """Which contacts serve it; any other contact is a foul. Where no contact does,
     none is a foul but those in `bars` [N, F, C] bool."""
-    bars: Tensor = None  # type: ignore[assignment]
+    bars: Tensor = field(default_factory=_left_out)
     """Which contacts are a foul in any case [N, F, C] bool; None: none."""
-    level: Tensor = None  # type: ignore[assignment]
+    level: Tensor = field(default_factory=_left_out)
     """How much of it is reached: what the reward counts [N]; None: 1 where it holds."""
-    still: Tensor = None  # type: ignore[assignment]
+    still: Tensor = field(default_factory=_left_out)
     """Objects whose motion the dense reward penalizes [N, C] bool; None: none."""
-    may_move: Tensor = None  # type: ignore[assignment]
+    may_move: Tensor = field(default_factory=_left_out)
     """Objects that may be moved; moving others is a foul [N, C] bool; None: all."""
-    aim: Tensor = None  # type: ignore[assignment]
+    aim: Tensor = field(default_factory=_left_out)
     """Where fingertips should be to serve it, from each object's center [N, C, 3] [m];
     None: at it."""
-    stage: Tensor = None  # type: ignore[assignment]
+    stage: Tensor = field(default_factory=_left_out)
     """How many goals of a sequence `Then` are reached [N] int64; None: 0."""
 
     def __post_init__(self) -> None:
-        objects = self.serves[:, 0]  # [N, C]
+        """Have what was left out come later."""
         defaults = {
             "bars": lambda: torch.zeros_like(self.serves),
-            "level": self.holds.float,
-            "still": lambda: torch.zeros_like(objects),
-            "may_move": lambda: torch.ones_like(objects),
-            "aim": lambda: objects[..., None] * torch.zeros(3, device=objects.device),
+            "level": lambda: self.holds.float(),
+            "still": lambda: torch.zeros_like(self._objects),
+            "may_move": lambda: torch.ones_like(self._objects),
+            "aim": lambda: self._objects[..., None] * self.gap.new_zeros(3),
             "stage": lambda: torch.zeros_like(self.holds, dtype=torch.int64),
         }
-        for name, make in defaults.items():
-            if getattr(self, name) is None:
-                object.__setattr__(self, name, make())
+        missing = {name for name in defaults if vars(self)[name] is None}
+        vars(self).update((name, later(defaults[name])) for name in missing)
+        vars(self)["_missing"] = missing
+        super().__post_init__()
+
+    @property
+    def _objects(self) -> Tensor:
+        """Something of the objects' shape [N, C] bool."""
+        return self.serves[:, 0]
+
+    def has(self, name: str) -> bool:
+        """Return whether a field was given, not left out."""
+        return name not in vars(self)["_missing"]
 
     @staticmethod
     def where(chosen: Tensor, first: Measure, second: Measure) -> Measure:
@@ -204,7 +222,8 @@ class Measure:
             a, b = getattr(first, name), getattr(second, name)
             return torch.where(chosen.view(-1, *[1] * (a.ndim - 1)), a, b)
 
-        return Measure(**{name: pick(name) for name in vars(first)})
+        names = [field.name for field in fields(Measure)]
+        return Measure(**{name: later(partial(pick, name)) for name in names})
 
 
 # -- Goals -----------------------------------------------------------------------------
@@ -267,7 +286,7 @@ class Touch(Goal):
         serves = asked.hand[:, :, None] & asked.ref[:, None]  # [N, F, C]
         fingers = (scene.contact & serves).any(dim=2).sum(dim=1)  # [N]
         holds = fingers > 0
-        gap = nearest(scene, serves).masked_fill(holds, 0.0)
+        gap = later(lambda: nearest(scene, serves).masked_fill(holds, 0.0))
         return Measure(holds, gap, serves, level=fingers.float(), still=asked.ref)
 
 
@@ -356,13 +375,13 @@ class Both(Goal):
         holds = a.holds & b.holds
         return Measure(
             holds=holds,
-            gap=torch.maximum(a.gap, b.gap),
+            gap=later(lambda: torch.maximum(a.gap, b.gap)),
             serves=a.serves | b.serves,
             bars=a.bars | b.bars,
             level=(a.level + b.level) * torch.where(holds, 1.0, Both.HALF),
-            still=a.still | b.still,
+            still=later(lambda: a.still | b.still),
             may_move=a.may_move | b.may_move,
-            aim=a.aim + b.aim,
+            aim=later(lambda: a.aim + b.aim),
         )
 
 

@@ -8,14 +8,51 @@ Legend: N envs, F fingers, C objects.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 
+class Later:
+    """What a field of a `Lazy` dataclass shall be, worked out when it is first read."""
+
+    def __init__(self, work: Callable[[], Tensor]) -> None:
+        self.work = work
+
+
+def later(work: Callable[[], Tensor]) -> Tensor:
+    """Return what stands for a tensor in a `Lazy` dataclass until it is read."""
+    return cast(Tensor, Later(work))
+
+
+class Lazy:
+    """A frozen dataclass whose fields may come `later`: most steps read few of them."""
+
+    def __post_init__(self) -> None:
+        """Set aside what comes later; `__getattr__` is asked for what is not there."""
+        found = {k: v.work for k, v in vars(self).items() if isinstance(v, Later)}
+        for name in found:
+            del vars(self)[name]
+        if found:
+            vars(self)["_later"] = found
+
+    def __getattr__(self, name: str) -> Any:
+        work = vars(self).get("_later", {}).get(name)
+        if work is None:
+            raise AttributeError(f"{type(self).__name__} has no {name!r}")
+        value = vars(self)[name] = work()
+        return value
+
+    def values(self) -> list[Any]:
+        """Return the values of all fields in their order."""
+        return [getattr(self, field.name) for field in fields(cast(Any, self))]
+
+
 @dataclass(frozen=True)
-class Snapshot:
+class Snapshot(Lazy):
     """N scenes at one step of their episodes. Robot frame: x forward, y left, z up."""
 
     contact: Tensor
@@ -58,7 +95,7 @@ class Snapshot:
 
     def rows(self, index: Tensor) -> Snapshot:
         """Return some of the scenes [M], each as often as its row is named."""
-        return Snapshot(*(part[index] for part in vars(self).values()))
+        return Snapshot(*(part[index] for part in self.values()))
 
     def at_stage(self, stage: Tensor) -> Snapshot:
         """Return the same scenes at another stage of their goals [N] int64."""
@@ -66,7 +103,7 @@ class Snapshot:
 
     def pack(self) -> Tensor:
         """Return all of it as one row of numbers per env [N, P] float32."""
-        parts = [part.reshape(len(part), -1) for part in vars(self).values()]
+        parts = [part.reshape(len(part), -1) for part in self.values()]
         return torch.cat([part.float() for part in parts], dim=1)
 
     @classmethod

@@ -188,8 +188,9 @@ def test_a_batch_of_mixed_goals_is_measured_as_each_alone():
         fields = vars(at).items()
         one = dataclasses.replace(at, **{k: v[env : env + 1] for k, v in fields})
         alone, judged = measured(goals[which], one)
-        for name, value in vars(alone).items():
-            torch.testing.assert_close(getattr(together, name)[env], value[0])
+        for field in dataclasses.fields(alone):
+            mixed, value = (getattr(each, field.name) for each in (together, alone))
+            torch.testing.assert_close(mixed[env], value[0])
         assert torch.equal(verdict.wrong[env], judged.wrong[0])
 
 

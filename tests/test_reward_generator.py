@@ -17,6 +17,7 @@ from ir_maniskill.environment.reward_generator import (
     reward_terms,
     sparse_reward,
 )
+from ir_maniskill.snapshot import later
 
 LINE = catalog.get("NaoTouchCubeMulti-v1")
 TRIANGLE = catalog.get("NaoTouchCubeTriangle-v1")
@@ -128,3 +129,21 @@ def test_weights_that_cannot_work_are_refused(change):
         ValueError, match=r"reward_weights\.\w+: got .* expected a finite"
     ):
         RewardWeights(**change)
+
+
+def test_what_only_the_dense_reward_needs_is_not_read_before():
+    read = []
+
+    def fingertips():
+        read.append("fingertip")
+        return torch.zeros(1, 6, 3)
+
+    at = dataclasses.replace(scene((0, 1)), fingertip=later(fingertips))
+    measure, verdict = measured(at, Touch(Ref("red")))
+    assert verdict.right.sum() == 1 and not verdict.foul.any()
+    assert sparse_reward(LINE, measure.holds, measure.level, verdict.wrong).sum() > 0
+    assert read == []
+    terms = reward_terms(at, measure, verdict, torch.tensor([False]))
+    assert read == ["fingertip"]
+    assert torch.equal(terms, reward_terms(at, measure, verdict, torch.tensor([False])))
+    assert read == ["fingertip"]

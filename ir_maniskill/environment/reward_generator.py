@@ -55,19 +55,25 @@ class Verdict:
 
 def judge(scene: Snapshot, measure: Measure) -> Verdict:
     """Tell right from wrong contacts, and whether something was disturbed."""
-    serves, fouls = measure.serves & ~measure.bars, forbidden(measure)  # [N, F, C]
-    moved = scene.moved.norm(dim=2) > MOVED  # [N, C]
+    serves, fouls = measure.serves, forbidden(measure)  # [N, F, C]
+    if measure.has("bars"):
+        serves = serves & ~measure.bars
+    disturbed = torch.zeros_like(measure.holds)
+    if measure.has("may_move"):
+        moved = scene.moved.norm(dim=2) > MOVED  # [N, C]
+        disturbed = (moved & ~measure.may_move).any(dim=1)
     return Verdict(
         right=(scene.contact & serves).any(dim=2),
         wrong=(scene.contact & fouls).any(dim=2),
-        disturbed=(moved & ~measure.may_move).any(dim=1),
+        disturbed=disturbed,
     )
 
 
 def forbidden(measure: Measure) -> Tensor:
     """Return which contacts a goal does not allow [N, F, C] bool."""
     asks = measure.serves.flatten(1).any(dim=1)[:, None, None]
-    return measure.bars | (asks & ~measure.serves)
+    fouls = asks & ~measure.serves
+    return fouls | measure.bars if measure.has("bars") else fouls
 
 
 def sparse_reward(

@@ -129,7 +129,7 @@ _TERMS = [
     _privileged("gap", "1", lambda env, _: env.measure.gap[:, None]),
     _privileged("wrong_once", "1", _wrong_once),
     Term("named_position", "none", "3", read=_named_position),
-    Term("snapshot", "none", "P", lambda env, _: env.snapshot().pack(), asked=True),
+    Term("snapshot", "none", "P", lambda env, _: env.judged().pack(), asked=True),
     Term(
         *("joint_velocity", "none", "J", lambda env, _: env.agent.joint_velocity()),
         asked=True,

@@ -37,7 +37,7 @@ from ir_maniskill.environment.speaker import Speaker
 from ir_maniskill.environment.table_objects import TableObjects
 from ir_maniskill.experiment import Experiment, ExperimentError, Spoken
 from ir_maniskill.goals import GoalError, Instruction
-from ir_maniskill.snapshot import Snapshot
+from ir_maniskill.snapshot import Snapshot, later
 
 CONTROL_FREQ = 20
 """Steps of an episode in a second [Hz]."""
@@ -353,16 +353,28 @@ class TouchEnv(RenderedEnv):
         Contacts are those of the last step; after a reset or a change of the state
         there are none until the next step.
         """
+        return Snapshot(*self._scene().values())
+
+    def _scene(self) -> Snapshot:
+        """Return the same, of which some is read from the simulator when it is asked.
+
+        It is for this very step: later the simulator would say something else.
+        """
+        robot, table = self.agent, self.table
         return Snapshot(
-            contact=self.table.contact(self._touch.read()),
-            fingertip=self.agent.finger_position() / self.agent.scale,
-            pose=self.table.poses() / self._size,
+            contact=table.contact(self._touch.read()),
+            fingertip=later(lambda: robot.finger_position() / robot.scale),
+            pose=table.poses() / self._size,
             start=self._start / self._size,
-            velocity=self.table.velocities() / self.agent.scale,
-            color=self.table.color,
-            shape=self.table.shape,
+            velocity=later(lambda: table.velocities() / robot.scale),
+            color=table.color,
+            shape=table.shape,
             stage=self._stage,
         )
+
+    def judged(self) -> Snapshot:
+        """Return what `evaluate` judged, at the stage of the goals that it brought."""
+        return self._judged.at_stage(self._stage)
 
     def get_info(self) -> dict[str, Tensor]:
         """Return what `evaluate` measures, and `elapsed_steps` since the reset [N]."""
@@ -381,7 +393,7 @@ class TouchEnv(RenderedEnv):
             `exclusive_success` (it has held, without any foul) as bool; `contact`
             [N, F, C] bool; and in the dense reward modes `reward_terms` [N, K].
         """
-        scene = self.snapshot()
+        self._judged = scene = self._scene()
         self.measure = self._goals.measure(scene)
         self.verdict = reward_generator.judge(scene, self.measure)
         if self._stepped:

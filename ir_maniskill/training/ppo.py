@@ -48,7 +48,8 @@ class PPO(Algorithm):
         self.agent = Agent(config.agent, spec).to(state["instruction"].device)
         distributed.copy_from_first(self.agent)
         rate = config.ppo.learning_rate
-        self.optimizer = torch.optim.Adam(self.agent.parameters(), rate, eps=1e-5)
+        weights = self.agent.parameters()
+        self.optimizer = torch.optim.Adam(weights, rate, eps=1e-5, fused=True)
         self.rollout = Rollout(config.steps_per_env, state, actions)
         self.reward_scale = RewardScale(self.rollout.num_envs, config.ppo.gamma)
         self.curriculum = Curriculum(config.reward_weights, config.penalty_warmup)
