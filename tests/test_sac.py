@@ -14,7 +14,7 @@ from ir_maniskill.environment.senses import StateStack
 from ir_maniskill.training import checkpoint
 from ir_maniskill.training.algorithm import Outcome
 from ir_maniskill.training.hindsight import Hindsight
-from ir_maniskill.training.sac import SAC, Critics
+from ir_maniskill.training.sac import SAC, Critics, adam
 from ir_maniskill.training.train import run
 
 
@@ -134,6 +134,18 @@ def test_the_policy_learns_to_do_what_the_teacher_does(tmp_path) -> None:
     for _ in range(60):
         algorithm._imitate(algorithm._draw_seen())
     assert off() < 0.3 * before
+
+
+def test_weights_of_convolutions_go_down_their_own_slope(tmp_path) -> None:
+    algorithm = collected(tmp_path, ToyVectorEnv(snapshots=True), episodes=0)
+    torch.manual_seed(0)
+    layer = torch.nn.Conv2d(3, 4, 3)
+    maps = torch.randn(2, 6, 6, 3).permute(0, 3, 1, 2)  # in memory, channels are last
+    before = layer.weight.detach().clone()
+    (slope,) = torch.autograd.grad(layer(maps).square().sum(), [layer.weight])
+    algorithm._optimizers["layer"] = adam(layer.parameters(), 0.01)
+    algorithm._step("layer", layer(maps).square().sum())
+    assert torch.equal((layer.weight.detach() - before).sign(), -slope.sign())
 
 
 def test_every_episode_is_kept_whole(tmp_path) -> None:
