@@ -41,7 +41,7 @@ def test_the_truth_is_what_lies_there() -> None:
 
 
 def test_each_kind_has_a_color_and_a_shape() -> None:
-    kind = kinds()[number("red", "can")]
+    kind = kinds(torch.zeros(1))[number("red", "can")]
     assert kind.sum() == 2
     assert kind[list(COLORS).index("red")] == 1
     assert kind[len(COLORS) + SHAPES.index("can")] == 1
@@ -58,7 +58,7 @@ def test_cells_are_the_pixels_of_squares() -> None:
 
 def test_bytes_are_seen_as_numbers_from_minus_one_to_one() -> None:
     torch.manual_seed(0)
-    camera = CameraView(1, high=2, wide=2)
+    camera = CameraView(1)
     byte = torch.randint(256, (1, 2, 2, 48), dtype=torch.uint8)
     weight, bias = camera.cells.parameters()
     expected = functional.linear(byte * (2 / 255) - 1, weight, bias)

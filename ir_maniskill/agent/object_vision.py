@@ -17,18 +17,22 @@ CELL, CHANNELS, WIDTH = 4, 32, 128
 """Side of a cell [pixel], maps of a camera, units of what is found."""
 HEADS, ROUNDS, NAME = 4, 2, 16
 """Objects looked at together, how often in a row, units of a kind's name."""
-KINDS = len(COLORS) * len(SHAPES)
-"""O."""
+KINDS, FLAGS = len(COLORS) * len(SHAPES), len(COLORS) + len(SHAPES)
+"""O, and how many colors and shapes there are."""
 LENGTH = 0.1
 """What places are divided by [m]."""
 SHARP = 12.0
 """Factor of how well a cell fits a kind, so that few cells count from the start."""
 
 
-def kinds() -> Tensor:
-    """Return the color and the shape of each kind of object, as flags [O, 10]."""
-    color = torch.eye(len(COLORS)).repeat_interleave(len(SHAPES), dim=0)
-    return torch.cat([color, torch.eye(len(SHAPES)).repeat(len(COLORS), 1)], dim=1)
+def kinds(like: Tensor) -> Tensor:
+    """Return the color and the shape of each kind of object, as flags [O, FLAGS].
+
+    They are numbers as `like` has them, and where it is.
+    """
+    color, shape = (torch.eye(n).to(like) for n in (len(COLORS), len(SHAPES)))
+    color = color.repeat_interleave(len(SHAPES), dim=0)
+    return torch.cat([color, shape.repeat(len(COLORS), 1)], dim=1)
 
 
 def truth(scene: Snapshot) -> tuple[Tensor, Tensor]:
@@ -59,18 +63,14 @@ def cells(images: Tensor) -> Tensor:
 class CameraView(nn.Module):
     """What one camera sees of each kind of object, where it fits best."""
 
-    def __init__(self, frames: int, high: int, wide: int) -> None:
-        """Make the layers for `frames` stacked images of so many cells."""
+    def __init__(self, frames: int) -> None:
+        """Make the layers for `frames` stacked images."""
         super().__init__()
         self.cells = nn.Linear(3 * frames * CELL**2, CHANNELS)
         self.convolutions = nn.ModuleList(
             nn.Conv2d(CHANNELS, CHANNELS, 3, padding=1) for _ in range(2)
         )
-        self.fit = nn.Linear(CHANNELS, kinds().shape[1])
-        places = torch.linspace(-1, 1, high), torch.linspace(-1, 1, wide)
-        grid = torch.stack(torch.meshgrid(*places, indexing="ij"), dim=-1)
-        self.register_buffer("grid", grid.flatten(0, 1), persistent=False)
-        self.register_buffer("kinds", kinds(), persistent=False)
+        self.fit = nn.Linear(CHANNELS, FLAGS)
 
     def forward(self, cells: Tensor) -> Tensor:
         """Return how well each kind fits, where, and the maps there [N, O, 3 + D]."""
@@ -78,12 +78,13 @@ class CameraView(nn.Module):
         for convolve in self.convolutions:
             maps = convolve(maps.permute(0, 3, 1, 2))  # in memory, channels stay last
             maps = _normed(maps.permute(0, 2, 3, 1))
+        grid = _places(maps)
         maps = maps.flatten(1, 2)  # [N, T, D]
         # A kind fits as well as its color and its shape do.
-        fits = SHARP * self.fit(maps) @ self.kinds.T.to(maps.dtype)
+        fits = SHARP * self.fit(maps) @ kinds(maps).T
         fits = fits.transpose(1, 2).contiguous()  # [N, O, T]
         looks = fits.softmax(dim=2)
-        best, at = fits.amax(dim=2, keepdim=True), looks @ self.grid.to(looks.dtype)
+        best, at = fits.amax(dim=2, keepdim=True), looks @ grid.to(looks)
         return torch.cat([best / SHARP, at, looks @ maps], dim=2)
 
     def read(self, cells: Tensor) -> Tensor:
@@ -94,6 +95,12 @@ class CameraView(nn.Module):
         fast = torch.is_autocast_enabled("cpu")
         number = torch.get_autocast_dtype("cpu") if fast else weight.dtype
         return functional.linear(cells.to(number), weight, bias)
+
+
+def _places(maps: Tensor) -> Tensor:
+    """Return where the cells of maps [N, H, W, C] are, each from -1 to 1 [H W, 2]."""
+    sides = (torch.linspace(-1, 1, n, device=maps.device) for n in maps.shape[1:3])
+    return torch.stack(torch.meshgrid(*sides, indexing="ij"), dim=-1).flatten(0, 1)
 
 
 def _normed(maps: Tensor) -> Tensor:
@@ -153,11 +160,9 @@ class ObjectVision(nn.Module):
     def __init__(self, frames: int, size: tuple[int, int, int], said: int) -> None:
         """Make the nets for images of `size` (cameras, height, width)."""
         super().__init__()
-        count, high, wide = size[0], size[1] // CELL, size[2] // CELL
-        self.cameras = nn.ModuleList(
-            CameraView(frames, high, wide) for _ in range(count)
-        )
-        self.name = nn.Linear(kinds().shape[1], NAME)
+        count = size[0]
+        self.cameras = nn.ModuleList(CameraView(frames) for _ in range(count))
+        self.name = nn.Linear(FLAGS, NAME)
         inputs = count * (3 + CHANNELS) + NAME
         hidden = nn.Linear(inputs, 64), nn.LayerNorm(64), nn.ReLU()
         self.place = nn.Sequential(*hidden, nn.Linear(64, 4))
@@ -166,12 +171,12 @@ class ObjectVision(nn.Module):
         nn.init.constant_(self.sure.bias, -2.0)
         """That something fits well says most of whether it is there."""
         self.finder = Finder(said)
-        self.register_buffer("kinds", kinds(), persistent=False)
 
     def forward(self, images: Tensor, language: Tensor) -> Tensor:
         """Return V_t [N, D] of images [N, S, K, H, W, 3], seen as G_t [N, D'] asks."""
         views = zip(self.cameras, cells(images), strict=True)
-        names = self.name(self.kinds).expand(len(images), -1, -1)  # [N, O, NAME]
+        flags = kinds(self.name.weight)
+        names = self.name(flags).expand(len(images), -1, -1)  # [N, O, NAME]
         seen = torch.cat([*(camera(each) for camera, each in views), names], dim=2)
         there, place = self.place(seen).float().split((1, 3), dim=2)
         best = seen[..., :: 3 + CHANNELS][..., : len(self.cameras)]  # of each camera
