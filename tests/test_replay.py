@@ -45,16 +45,6 @@ def test_the_oldest_rows_make_room_and_episodes_go_round_the_end() -> None:
     assert replay.bytes == 7 * 8 * (1 + 2 + 3)
 
 
-def test_several_steps_of_an_episode_are_drawn_together() -> None:
-    replay = Replay(30)
-    replay.add(episode(0, 9))
-    replay.add(episode(100, 5))
-    groups = replay.read("number", replay.draw(50, each=3)).view(3, 50)
-    of_second = (groups >= 100).float().mean(dim=0)
-    assert set(of_second.tolist()) == {0.0, 1.0}
-    assert (groups[0] != groups[1]).any()
-
-
 def test_an_episode_fits_or_is_refused() -> None:
     with pytest.raises(ValueError, match="got an episode of 4 rows, room for 3"):
         Replay(3).add(episode(0, 4))

@@ -121,11 +121,11 @@ class StateEncoder(nn.Module):
         if self.felt:
             inputs = sum(math.prod(spec.shapes[name]) for name in self.felt)
             self.body = BodySense(inputs, normalize=config.vision != "paper")
-        self.reading_width = self.width = width  # of G_t, and below of B_t
+        self.width = width  # of G_t, and below of B_t
         if self.vision is not None:
             objects = config.vision == "objects"
             self.width += ObjectVision.width if objects else VISION_WIDTH
-        self.seen = slice(self.reading_width, self.width)
+        self.seen = slice(width, self.width)
         """Where V_t is in B_t."""
         self.width += BODY_WIDTH if self.felt else 0
         self.alignment = Alignment()
@@ -141,18 +141,15 @@ class StateEncoder(nn.Module):
 
     def forward(self, state: State) -> Tensor:
         """Return B_t [N, D] = [G_t, V_t, H_t]."""
-        said = self.read(state)
+        said: Tensor = self.language(*(state[name] for name in self.language.reads))
+        if self.reading is not None:
+            said = self.reading(said)
         embeddings = [said]
         if self.vision is not None:
             embeddings.append(self.vision(state["images"], said))
         if self.body is not None:
             embeddings.append(self.body(*(self._sense(state, k) for k in self.felt)))
         return self.alignment(*embeddings)
-
-    def read(self, state: State) -> Tensor:
-        """Return G_t [N, D'] alone."""
-        said: Tensor = self.language(*(state[name] for name in self.language.reads))
-        return said if self.reading is None else self.reading(said)
 
     def _sense(self, state: State, name: str) -> Tensor:
         if name == "privileged" and self.standardize is not None:

@@ -20,7 +20,7 @@ HEADS, ROUNDS, NAME = 4, 2, 16
 KINDS, FLAGS = len(COLORS) * len(SHAPES), len(COLORS) + len(SHAPES)
 """O, and how many colors and shapes there are."""
 LENGTH = 0.1
-"""What places are divided by [m]."""
+"""What lengths are divided by, to be about as large as other numbers [m]."""
 SHARP = 12.0
 """Factor of how well a cell fits a kind, so that few cells count from the start."""
 

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from ir_maniskill import experiment as catalog
+from ir_maniskill.agent.object_vision import LENGTH
 from ir_maniskill.environment import reward_generator
 from ir_maniskill.environment.instructional_set import GoalBatch, GoalTable
 from ir_maniskill.environment.layout import layout_of
@@ -260,9 +261,6 @@ class Pursuit:
 
 
 # -- What critics read -----------------------------------------------------------------
-
-LENGTH = 0.1
-"""What lengths are divided by, to be about as large as other numbers [m]."""
 
 
 def describe(

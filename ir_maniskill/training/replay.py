@@ -98,19 +98,13 @@ class Replay:
 
     # -- Reading ---------------------------------------------------------------------
 
-    def draw(self, episodes: int, each: int = 1) -> Tensor:
-        """Return rows at random that have a next one, so many of each episode drawn.
-
-        Episodes are as likely as they are long: [episodes * each] int64.
-        """
+    def draw(self, count: int) -> Tensor:
+        """Return rows at random that have a next one [count] int64."""
         found = torch.empty(0, dtype=torch.int64)
-        while len(found) < episodes:
-            rows = torch.randint(len(self), (2 * episodes,))
+        while len(found) < count:
+            rows = torch.randint(len(self), (2 * count,))
             found = torch.cat([found, rows[self._whole(rows)]])
-        first = found[:episodes] - self._rows[AGE][found[:episodes]]
-        uniform = torch.rand(each, episodes)
-        step = (uniform * self._rows[LENGTH][found[:episodes]]).long()
-        return ((first + step) % self.capacity).flatten()
+        return found[:count]
 
     def _whole(self, rows: Tensor) -> Tensor:
         """Return which rows have a next one, and all of their episode is there [N]."""

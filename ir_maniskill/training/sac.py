@@ -23,7 +23,7 @@ from torch.nn import functional
 
 from ir_maniskill.agent.actor import Squashed, SquashedActor
 from ir_maniskill.agent.agent import Agent, StateSpec
-from ir_maniskill.agent.object_vision import ObjectVision
+from ir_maniskill.agent.object_vision import LENGTH, ObjectVision
 from ir_maniskill.checks import require
 from ir_maniskill.environment.senses import State, read_text
 from ir_maniskill.snapshot import Snapshot
@@ -38,7 +38,7 @@ from ir_maniskill.training.algorithm import (
 )
 from ir_maniskill.training.config import SACConfig, TrainConfig
 from ir_maniskill.training.finite import check_finite
-from ir_maniskill.training.hindsight import LENGTH, Hindsight, Pursuit, simulated
+from ir_maniskill.training.hindsight import Hindsight, Pursuit, simulated
 from ir_maniskill.training.replay import Replay
 
 log = logging.getLogger(__name__)
@@ -278,7 +278,7 @@ class SAC(Algorithm):
         What was there after the step is named "next.", as what was before it is named.
         """
         replay = self.replay
-        rows, which = self._rows(self.config.batch)
+        rows, which = self._rows()
         after = replay.after(rows)
         drawn = self._read(rows, which) | {"action": replay.read("action", rows)}
         drawn |= {f"next.{k}": v for k, v in self._read(after, which).items()}
@@ -289,7 +289,7 @@ class SAC(Algorithm):
     def _draw_seen(self) -> State:
         """Return a batch of states as the policy perceives them, and the truth."""
         replay = self.replay
-        rows, which = self._rows(self.config.batch)
+        rows, which = self._rows()
         sensed = self.agent.encoder.sensed
         seen = {name: replay.read(name, rows, frames=self.frames) for name in sensed}
         seen |= {k: replay.read(k, rows, column=which) for k in self._sentence}
@@ -298,11 +298,11 @@ class SAC(Algorithm):
         named = replay.read("named", rows, column=which)
         return seen | self._read(rows, which) | {"named": named}
 
-    def _rows(self, count: int) -> tuple[Tensor, Tensor]:
+    def _rows(self) -> tuple[Tensor, Tensor]:
         """Return rows [B], and under which of its sentences to see each [B]."""
-        which = torch.randint(self.hindsight.sentences, (count,))
-        which[torch.rand(count) < self.config.own] = 0
-        return self.replay.draw(count), which
+        which = torch.randint(self.hindsight.sentences, (self.config.batch,))
+        which[torch.rand(len(which)) < self.config.own] = 0
+        return self.replay.draw(len(which)), which
 
     def _read(self, rows: Tensor, which: Tensor) -> State:
         """Return what critics read of some rows, before it is put together."""
