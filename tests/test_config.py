@@ -123,7 +123,9 @@ def version_1(name):
     return checkpoint.read(POLICIES / f"{name}.safetensors").metadata["config"]
 
 
-@pytest.mark.parametrize("path", sorted(POLICIES.glob("*.safetensors")), ids=str)
+@pytest.mark.parametrize(
+    "path", sorted(POLICIES.glob("NaoTouch*.safetensors")), ids=str
+)
 def test_what_was_shipped_with_0_1_is_understood(path):
     old = checkpoint.read(path).metadata["config"]
     config = from_data(old)
