@@ -322,7 +322,12 @@ class Push(Goal):
         aside = (moved - along[:, None] * asked.direction)[:, :2].norm(dim=1)
         holds = (along >= asked.distance) & (aside <= Push.STRAIGHT * along)
         strayed = (aside - Push.STRAIGHT * along.clamp(min=0)).clamp(min=0)
-        gap = ((asked.distance - along).clamp(min=0) + strayed).masked_fill(holds, 0.0)
+        serves = asked.ref[:, None].expand_as(scene.contact)
+        behind = -Push.BEHIND * asked.ref[..., None] * asked.direction[:, None]
+        way = (scene.to_object - behind[:, None]).norm(dim=3)
+        way = way.where(serves, torch.inf).flatten(1).amin(dim=1)
+        gap = (asked.distance - along).clamp(min=0) + strayed + way
+        gap = gap.masked_fill(holds, 0.0)
         progress = Push.LEVEL * (along / asked.distance).clamp(0, 1)
         serves = asked.ref[:, None].expand_as(scene.contact)
         behind = -Push.BEHIND * asked.ref[..., None] * asked.direction[:, None]

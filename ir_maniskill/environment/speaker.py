@@ -20,6 +20,9 @@ from ir_maniskill.language.tokens import split_words
 SCENES = 5000
 """How many scenes are drawn at most to find one that a sentence is true of."""
 
+PATIENCE = 100
+"""How many of them for a kind of sentence, before another one will do."""
+
 BY_HAND = 0.5
 """Share of the sentences of the split `wording` that were written by hand."""
 
@@ -62,14 +65,16 @@ class Speaker:
         self, stream: np.random.RandomState, told: Instruction | None
     ) -> tuple[np.ndarray, np.ndarray, Instruction]:
         rng = Random(int(stream.uniform() * 2**53))
-        wanted = told
+        kind, wanted = rng.choice(self.spoken.kinds), told
         if told is None and self.spoken.split == "wording" and rng.random() < BY_HAND:
             wanted = self.by_hand[int(rng.random() * len(self.by_hand))]
-        for _ in range(SCENES):
+        for tried in range(SCENES):
             slot, xy = self.layout.lay_out(stream.uniform(size=(1, self.layout.noise)))
             there = self._things(slot[0], xy[0])
             if wanted is None:
-                instruction = self.say(there, rng)
+                # One that a hand alone cannot do, say, is not to be had.
+                kinds = (kind,) if tried < PATIENCE else self.spoken.kinds
+                instruction = self.say(there, rng, kinds)
             else:
                 free = told is not None  # what users ask for need not be in reach
                 fits = self.is_true(wanted.goal, there) and (
@@ -91,11 +96,16 @@ class Speaker:
             if index >= 0
         ]
 
-    def say(self, scene: Sequence[Thing], rng: Random) -> Instruction | None:
-        """Return something to say of a scene; None: there is nothing."""
+    def say(
+        self, scene: Sequence[Thing], rng: Random, kinds: Sequence[str] = ()
+    ) -> Instruction | None:
+        """Return something to say of a scene; None: there is nothing.
+
+        It is of one of the kinds, or of any that the experiment has.
+        """
         spoken, allows = self.spoken, self.layout.allows(scene)
         try:
-            goal = draw(scene, spoken.kinds, rng, spoken.split, allows)
+            goal = draw(scene, kinds or spoken.kinds, rng, spoken.split, allows)
         except GoalError:
             return None
         return Instruction(sentence(goal, rng, spoken.split), goal)

@@ -90,17 +90,17 @@ class SACConfig:
     any of its sentences."""
     batch: int = 256
     """Steps of each gradient."""
-    gradients: int = 4
+    gradients: int = 2
     """Gradients of the critics for each step of all envs; the teacher has half of
     them."""
-    policy_from: float = 0.47
-    """Share of the training before the policy begins to learn, less than 1: at first
-    there is little to imitate."""
+    policy_from: float = 0.55
+    """Share of the training in which the teacher learns; in the rest, the policy
+    learns from it."""
     imitations: int = 2
-    """Gradients of the policy for each step of all envs, from then on."""
+    """Gradients of the policy for each step of all envs."""
     policy_acts: float = 0.75
     """Share of the envs in which the policy acts at the end, and none at the start."""
-    learning_rate: float = 3e-4
+    learning_rate: float = 1e-3
     """Adam's step size of critics and teacher."""
     policy_rate: float = 2e-3
     """Adam's step size of the policy."""
@@ -119,8 +119,8 @@ class SACConfig:
         require_fields(self, "others imitations", lambda x: x >= 0, "0 or more")
         shares = "gamma own policy_acts polyak"
         require_fields(self, shares, lambda x: 0 <= x <= 1, "0 to 1")
-        begun = "0 or more, less than 1"
-        require_fields(self, "policy_from", lambda x: 0 <= x < 1, begun)
+        begun = "more than 0, less than 1"
+        require_fields(self, "policy_from", lambda x: 0 < x < 1, begun)
         above = "learning_rate policy_rate reward_scale"
         require_fields(self, above, lambda x: 0 < x < math.inf, "more than 0")
 
@@ -246,7 +246,8 @@ CONFIGS: dict[str, TrainConfig] = {
     "default": TrainConfig(),
     "listen": TrainConfig(
         algorithm="sac",
-        total_steps=255_000,
+        total_steps=450_000,
+        eval_interval=50_000,
         threads=1,
         frames=1,
         penalty_warmup=0.0,

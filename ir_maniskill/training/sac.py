@@ -40,6 +40,7 @@ from ir_maniskill.training.config import SACConfig, TrainConfig
 from ir_maniskill.training.finite import check_finite
 from ir_maniskill.training.hindsight import Hindsight, Pursuit, simulated
 from ir_maniskill.training.replay import Replay
+from ir_maniskill.training.schedules import linear
 
 log = logging.getLogger(__name__)
 
@@ -47,10 +48,11 @@ TEMPERATURE = 0.03
 """Weight of the entropy at the start."""
 TEMPERATURE_RATE = 1e-3
 """Adam's step size of its logarithm."""
-ENTROPY = 0.25
-"""Entropy of each number of an action that the temperature aims at [nat]."""
+ENTROPY = (0.25, -0.75)
+"""Entropy of each number of an action that the temperature aims at, in the first third
+of the teacher's training and at its end [nat]."""
 WARMUP = 0.03
-"""Share of the policy's training in which its step size grows."""
+"""Share of a training in which the step size grows."""
 LONGEST = 10.0
 """Longest gradient of a step."""
 LOGGED = 64
@@ -140,7 +142,7 @@ class SAC(Algorithm):
         self.log_temperature = torch.tensor(math.log(TEMPERATURE), requires_grad=True)
         rate = self.config.learning_rate
         self._optimizers = {
-            "agent": adam(self.agent.parameters(), 0.0),  # `_imitate` sets the rate
+            "agent": adam(self.agent.parameters(), self.config.policy_rate),
             "teacher": adam(self.teacher.parameters(), rate),
             "critics": adam(self.critics.parameters(), rate),
             "temperature": adam([self.log_temperature], TEMPERATURE_RATE),
@@ -253,14 +255,11 @@ class SAC(Algorithm):
         if self.replay.written < self.config.random_steps:
             return {}
         self.updates += 1
-        for turn in range(self.config.gradients):
-            now = self._draw()
-            self._improve_critics(now)
-            if turn % 2 == 0:
-                self._improve_teacher(now)
         if self._schooling > 0:
             for _ in range(self.config.imitations):
                 self._imitate(self._draw_seen())
+        else:
+            self._teach()
         if self.updates % LOGGED:
             return {}
         history = sorted(self._history.items())  # a table's columns keep their order
@@ -323,6 +322,16 @@ class SAC(Algorithm):
         felt = read["now.proprioception"], read["now.target"]
         return torch.cat([*felt, speed, scene, read["goal"]], dim=1)
 
+    def _teach(self) -> None:
+        """Improve critics and teacher by a step of all envs."""
+        for name in ("critics", "teacher"):
+            self._set_rate(name, self.config.learning_rate, self._learned)
+        for turn in range(self.config.gradients):
+            now = self._draw()
+            self._improve_critics(now)
+            if turn % 2 == 0:
+                self._improve_teacher(now)
+
     def _improve_critics(self, now: State) -> None:
         """Bring Q to r + gamma (Q' - temperature log pi), Q' being what follows."""
         temperature = self.log_temperature.detach().exp()
@@ -349,7 +358,8 @@ class SAC(Algorithm):
         action, log_prob = self._taught(known).rsample()
         value = self.critics(known, action).amin(dim=0)
         self._step("teacher", (temperature * log_prob - value).mean())
-        excess = -ENTROPY * self.actions - log_prob.detach().mean()
+        entropy = linear(*ENTROPY, max(0.0, 1.5 * self._learned - 0.5))
+        excess = -entropy * self.actions - log_prob.detach().mean()
         self._step("temperature", self.log_temperature.exp() * excess)
         self._note(entropy=-log_prob.mean(), temperature=temperature)
 
@@ -372,8 +382,13 @@ class SAC(Algorithm):
             off = 2 * functional.huber_loss(guess / LENGTH, truth / LENGTH)
             loss = loss + self.agent.config.auxiliary_weight * off
             self._note(auxiliary=off, off=(guess - truth).norm(dim=1).median())
-        self._optimizers["agent"].param_groups[0]["lr"] = self._policy_rate()
+        self._set_rate("agent", self.config.policy_rate, self._schooling)
         self._step("agent", loss)
+
+    @property
+    def _learned(self) -> float:
+        """Which share of its own training the teacher has behind it."""
+        return min(1.0, self.share / self.config.policy_from)
 
     @property
     def _schooling(self) -> float:
@@ -381,10 +396,10 @@ class SAC(Algorithm):
         begun = self.config.policy_from
         return max(0.0, (self.share - begun) / (1 - begun))
 
-    def _policy_rate(self) -> float:
-        """Return Adam's step size: it grows at first, and shrinks in the last third."""
-        grown, left = self._schooling / WARMUP, 3 * (1 - self._schooling)
-        return self.config.policy_rate * min(grown + 0.02, left + 0.02, 1.0)
+    def _set_rate(self, name: str, rate: float, share: float) -> None:
+        """Let an optimizer's step size grow at first, and shrink in the last third."""
+        part = min(share / WARMUP + 0.02, 3 * (1 - share) + 0.02, 1.0)
+        self._optimizers[name].param_groups[0]["lr"] = rate * part
 
     def _step(self, name: str, loss: Tensor) -> None:
         """Make one step of an optimizer; the others' weights get no gradient."""
