@@ -117,9 +117,12 @@ def test_with_the_other_hand_a_touch_is_a_foul():
     ],
 )
 def test_push_measures_the_way_along_and_to_the_side(moved, holds, gap, level):
-    measure, verdict = measured(Push(RED, "left", 0.05), scene(moved=moved, which=1))
+    at = scene(moved=moved, which=1)
+    at.fingertip[:, 4] = at.position[:, 1] - torch.tensor([0.03, 0.04, 0.0])
+    measure, verdict = measured(Push(RED, "left", 0.05), at)
     assert measure.holds.item() == holds
-    assert measure.gap.item() == pytest.approx(gap)
+    # A finger still has 3 cm to go until it is 4 cm behind what it is to push.
+    assert measure.gap.item() == pytest.approx(0 if holds else gap + 0.03, abs=1e-4)
     assert measure.level.item() == pytest.approx(level)
     assert not verdict.foul
 

@@ -106,6 +106,11 @@ def test_sentences_are_of_their_split_and_true_of_their_scene(
             assert all(held) if split == "places" else not any(held)
 
 
+def test_kinds_are_equally_frequent_though_some_fit_fewer_scenes() -> None:
+    said = [kind_of(said.goal) for _, _, said in drawn(instruct.ALL, "train", 1000)]
+    assert all(160 < said.count(kind) < 240 for kind in instruct.ALL.instructions.kinds)
+
+
 def test_training_has_thousands_of_sentences_of_forty_words() -> None:
     texts = {said.text for _, _, said in drawn(instruct.ALL, "train", 1000)}
     assert len(texts) > 900

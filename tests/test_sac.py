@@ -111,13 +111,33 @@ def test_the_policy_acts_in_ever_more_of_the_envs(tmp_path) -> None:
     algorithm.agent.policy = lambda state: torch.full((len(state["touch"]), 2), 5.0)
     state = StateStack(1).reset(envs.reset(seed=0)[0])
     algorithm.config = dataclasses.replace(
-        algorithm.config, policy_acts=0.5, policy_from=0.0
+        algorithm.config, policy_acts=0.5, policy_from=0.2
     )
     by_policy = []
-    for share in (0.0, 0.5, 1.0):
+    for share in (0.1, 0.6, 1.0):
         algorithm.share = share
         by_policy.append(int((algorithm.act(state) == 5.0).all(dim=1).sum()))
     assert by_policy == [0, 1, 2]
+
+
+def test_the_teacher_learns_first_and_then_stays_as_it_is(tmp_path) -> None:
+    algorithm = collected(tmp_path, ToyVectorEnv(snapshots=True), episodes=40)
+
+    def changed(share):
+        algorithm.share, before = share, algorithm.state_dict()
+        algorithm.update()
+        after = algorithm.state_dict()
+        parts = ("agent.", "teacher.", "critics.")
+        return [
+            any(
+                not torch.equal(before[k], after[k]) for k in after if k.startswith(p)
+            )
+            for p in parts
+        ]
+
+    begun = algorithm.config.policy_from
+    assert changed(0.9 * begun) == [False, True, True]
+    assert changed(1.1 * begun) == [True, False, False]
 
 
 def test_the_policy_learns_to_do_what_the_teacher_does(tmp_path) -> None:
