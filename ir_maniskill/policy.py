@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.agent.agent import Agent
+from ir_maniskill.agent.language_system import encoder_of
 from ir_maniskill.environment.robots.robot import short_name
 from ir_maniskill.environment.senses import (
     Observation,
@@ -116,10 +117,11 @@ class Policy:
         """Raise MismatchError unless it was trained for this task and robot.
 
         `robot` is what `robot_uids` takes, None its own; `any_task` accepts another
-        task, if it has the same words.
+        task, if it has the same words or the policy reads any.
         """
         pairs: dict[str, tuple[Any, Any]] = {}
-        if self.vocabulary != experiment.vocabulary:
+        reads_any = "instruction" not in encoder_of(self.config.agent).reads
+        if self.vocabulary != experiment.vocabulary and not (any_task and reads_any):
             pairs["vocabulary"] = self.vocabulary, experiment.vocabulary
         if robot is not None and short_name(robot) != short_name(self.config.robot):
             pairs["robot"] = self.config.robot, robot

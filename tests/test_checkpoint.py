@@ -17,7 +17,7 @@ from toy_envs import SPEC, ToyVectorEnv, toy_config, toy_state
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.agent import Agent
-from ir_maniskill.policy import Policy
+from ir_maniskill.policy import Policy, load_policy
 from ir_maniskill.training import checkpoint
 from ir_maniskill.training.algorithm import averages, copied
 from ir_maniskill.training.checkpoint import CheckpointError, MismatchError, Stored
@@ -363,5 +363,6 @@ def test_another_task_or_robot_is_refused(task):
     words = dataclasses.replace(other, vocabulary=swapped(other.vocabulary))
     with pytest.raises(MismatchError, match=r"vocabulary\[5\]"):
         policy_for(task).require_match(words, any_task=True)
+    load_policy("NaoInstruct-v1").require_match(words, any_task=True)  # it reads text
     with pytest.raises(MismatchError, match="robot: .*'nao', expected 'panda'"):
         policy_for(task).require_match(task, "panda")

@@ -81,8 +81,7 @@ class CameraView(nn.Module):
         grid = _places(maps)
         maps = maps.flatten(1, 2)  # [N, T, D]
         # A kind fits as well as its color and its shape do.
-        fits = SHARP * self.fit(maps) @ kinds(maps).T
-        fits = fits.transpose(1, 2).contiguous()  # [N, O, T]
+        fits = SHARP * kinds(maps) @ self.fit(maps).transpose(1, 2)  # [N, O, T]
         looks = fits.softmax(dim=2)
         best, at = fits.amax(dim=2, keepdim=True), looks @ grid.to(looks)
         return torch.cat([best / SHARP, at, looks @ maps], dim=2)
@@ -132,24 +131,17 @@ class Finder(nn.Module):
         `there` are logits [N, O]: what does not lie there is not looked at.
         """
         entries = self.entry(entries)
-        absent = functional.logsigmoid(there.float()).clamp(min=-9)[:, None, None]
+        absent = functional.logsigmoid(there.float()).clamp(min=-9)[..., None]
         known, found = said, said
         layers = zip(self.queries, self.keys, self.values, self.joins, strict=True)
         for query, key, value, join in layers:
-            asked, keys, values = (
-                _heads(each)
-                for each in (query(known)[:, None], key(entries), value(entries))
-            )
-            mask = absent.to(asked.dtype).expand(-1, HEADS, -1, -1)
-            seen = functional.scaled_dot_product_attention(asked, keys, values, mask)
-            found = join(torch.cat([seen.flatten(1), known], dim=1))
+            asked = query(known)[:, None] * key(entries) * (WIDTH // HEADS) ** -0.5
+            fits = asked.unflatten(2, (HEADS, -1)).sum(dim=3)  # [N, O, heads]
+            looks = (fits + absent).softmax(dim=1).to(asked.dtype)
+            seen = value(entries).unflatten(2, (HEADS, -1)) * looks[..., None]
+            found = join(torch.cat([seen.sum(dim=1).flatten(1), known], dim=1))
             known = torch.cat([said, found], dim=1)
         return found
-
-
-def _heads(values: Tensor) -> Tensor:
-    """Split units [N, O, D] by heads [N, heads, O, D / heads]."""
-    return values.unflatten(2, (HEADS, -1)).transpose(1, 2)
 
 
 class ObjectVision(nn.Module):
