@@ -110,6 +110,16 @@ def test_two_trainings_cannot_share_a_folder(tmp_path):
     RunFolder(tmp_path, resume=True).close()
 
 
+def test_a_figure_that_begins_later_gets_a_column_of_its_own(tmp_path):
+    folder = RunFolder(tmp_path, resume=False)
+    folder.begin(toy_config(tmp_path), 0)
+    for steps, figures in ((1, {"a": 1.0, "b": 2.0}), (2, {"b": 3.0, "c": 4.0})):
+        folder.log("metrics", steps, figures)
+    folder.close()
+    lines = (tmp_path / "metrics.csv").read_text().split()
+    assert lines == ["steps,a,b,c", "1,1.0,2.0,nan", "2,nan,3.0,4.0"]
+
+
 # -- Workers ---------------------------------------------------------------------------
 
 

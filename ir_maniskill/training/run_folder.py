@@ -9,7 +9,7 @@ import logging
 import os
 import signal
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +107,7 @@ class RunFolder:
                 f"{table}: got {error}, expected a column `steps` of whole numbers; "
                 "mend it, or move it away"
             ) from error
-        self.write(table.name, _format(rows, header=True))
+        self.write(table.name, _format(_columns(table), rows))
         return int(rows[-1]["steps"]) if rows else 0
 
     def write(self, name: str, data: bytes) -> None:
@@ -123,11 +123,18 @@ class RunFolder:
         log.warning("stopped at step %d: resume goes on there", steps)
 
     def log(self, table: str, steps: int, figures: Mapping[str, float]) -> None:
-        """Add a row to the CSV table, and a point to every TensorBoard curve."""
-        path = self.path / f"{table}.csv"
+        """Add a row to the CSV table, and a point to every TensorBoard curve.
+
+        A figure that is new gets a column, in which earlier rows have "nan".
+        """
+        path, row = self.path / f"{table}.csv", {"steps": steps, **figures}
+        columns = _columns(path)
+        if row.keys() - set(columns):
+            columns = list(dict.fromkeys([*columns, *row]))
+            rows = whole_rows(path) if path.exists() else []
+            self.write(path.name, _format(columns, rows))
         with writing(path), path.open("ab") as file:
-            row = {"steps": steps, **figures}
-            file.write(_format([row], header=file.tell() == 0))
+            file.write(_format(columns, [row], header=False))
             for name, value in figures.items():
                 assert self._events is not None, "begin comes first"
                 self._events.add_scalar(name, value, steps)
@@ -181,9 +188,19 @@ def whole_rows(table: Path) -> list[dict[str, str]]:
     return [row for row in rows if None not in row and None not in row.values()]
 
 
-def _format(rows: Sequence[Mapping[str, object]], *, header: bool) -> bytes:
+def _columns(table: Path) -> list[str]:
+    """Return the names in the first row of a CSV table; none if there is none."""
+    rows = whole_rows(table) if table.exists() else []
+    return list(rows[0]) if rows else []
+
+
+def _format(
+    columns: Sequence[str], rows: Iterable[Mapping[str, object]], *, header: bool = True
+) -> bytes:
     """Return the lines of a CSV table."""
     text = io.StringIO(newline="")
-    names = [list(row) for row in rows[:1] if header]
-    csv.writer(text).writerows(names + [list(row.values()) for row in rows])
+    writer = csv.DictWriter(text, columns, restval="nan")
+    if header and columns:
+        writer.writeheader()
+    writer.writerows(rows)
     return text.getvalue().encode()
