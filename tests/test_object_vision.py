@@ -73,6 +73,14 @@ def test_who_sees_all_has_no_loss(vision) -> None:
     assert vision.misseen(told, scene()) == pytest.approx(0.125, abs=1e-3)
 
 
+def test_a_pair_fits_as_well_as_its_color_and_its_shape(vision) -> None:
+    name = vision.name(kinds(vision.name.weight))
+    keys = vision.finder.keys[0](torch.cat([name, torch.ones(KINDS, 4)], dim=1))
+    red_cube, blue_can = keys[number("red", "cube")], keys[number("blue", "can")]
+    red_can, blue_cube = keys[number("red", "can")], keys[number("blue", "cube")]
+    torch.testing.assert_close(red_cube + blue_can, red_can + blue_cube)
+
+
 def test_what_does_not_lie_there_is_not_looked_at() -> None:
     torch.manual_seed(0)
     finder, said = Finder(6), torch.randn(1, 6)

@@ -108,15 +108,20 @@ def _normed(maps: Tensor) -> Tensor:
 
 
 class Finder(nn.Module):
-    """Attention of the sentence to what lies there; who looks again knows more."""
+    """Attention of the sentence to what lies there; who looks again knows more.
+
+    How well a thing fits is a sum over its color, its shape and where it lies, and what
+    is found is where. So a pair of color and shape that was never named is found as
+    others are.
+    """
 
     def __init__(self, said: int) -> None:
         """Make the layers for `said` units of G_t."""
         super().__init__()
-        self.entry = nn.Sequential(nn.Linear(NAME + 4, 64), nn.ReLU())
+        self.where = nn.Sequential(nn.Linear(4, 64), nn.ReLU())
         sizes = [said] + [said + WIDTH] * (ROUNDS - 1)
         self.queries = nn.ModuleList(nn.Linear(size, WIDTH) for size in sizes)
-        self.keys = nn.ModuleList(nn.Linear(64, WIDTH) for _ in sizes)
+        self.keys = nn.ModuleList(nn.Linear(NAME + 4, WIDTH) for _ in sizes)
         self.values = nn.ModuleList(nn.Linear(64, WIDTH) for _ in sizes)
         self.joins = nn.ModuleList(
             nn.Sequential(
@@ -130,7 +135,7 @@ class Finder(nn.Module):
 
         `there` are logits [N, O]: what does not lie there is not looked at.
         """
-        entries = self.entry(entries)
+        where = self.where(entries[..., NAME:])
         absent = functional.logsigmoid(there.float()).clamp(min=-9)[..., None]
         known, found = said, said
         layers = zip(self.queries, self.keys, self.values, self.joins, strict=True)
@@ -138,7 +143,7 @@ class Finder(nn.Module):
             asked = query(known)[:, None] * key(entries) * (WIDTH // HEADS) ** -0.5
             fits = asked.unflatten(2, (HEADS, -1)).sum(dim=3)  # [N, O, heads]
             looks = (fits + absent).softmax(dim=1).to(asked.dtype)
-            seen = value(entries).unflatten(2, (HEADS, -1)) * looks[..., None]
+            seen = value(where).unflatten(2, (HEADS, -1)) * looks[..., None]
             found = join(torch.cat([seen.sum(dim=1).flatten(1), known], dim=1))
             known = torch.cat([said, found], dim=1)
         return found
