@@ -83,11 +83,8 @@ def _complete(robot: Element, ours: Element) -> None:
         joint = joints[name]
         with naming(joint):
             limit, turns = joint.find("limit"), joint.get("type") == "revolute"
-            if (
-                limit is None
-                or not turns
-                or not set(urdf.LIMITS) <= limit.attrib.keys()
-            ):
+            said = set() if limit is None else set(limit.attrib)
+            if not (turns and said >= set(urdf.LIMITS)):
                 _replace(joint, limit, urdf.part(model, "limit"))
                 joint.set("type", "revolute")
             urdf.read_motor(joint)
@@ -113,23 +110,20 @@ def _find_files(robot: Element, home: Path) -> None:
     """Make the names of all meshes and textures absolute.
 
     Raises:
-        RobotError: Some are missing; the message names them and where they could be.
+        RobotError: Some are missing; names them, and the folders that were searched.
     """
-    missing: dict[str, list[str]] = {"mesh": [], "texture": []}
-    for element in robot.iter():
-        if element.tag in missing:
-            name = element.get("filename", "")
-            places = _places(name, home)
-            found = next((place for place in places if place.is_file()), None)
-            if found is None and name not in missing[element.tag]:
-                missing[element.tag].append(name)
-            element.set("filename", str(found))
-    if any(missing.values()):
-        kinds = {"meshes": missing["mesh"], "textures": missing["texture"]}
-        listed = (f"missing {k}: {', '.join(n[:3])}" for k, n in kinds.items() if n)
-        roots = (f"{key}={os.environ.get(key, '')}" for key in _ROOTS)
+    missing = []
+    for element in [*robot.iter("mesh"), *robot.iter("texture")]:
+        name = element.get("filename", "")
+        found = next((place for place in _places(name, home) if place.is_file()), None)
+        if found is None:
+            missing.append(name)
+        element.set("filename", str(found))
+    if missing:
+        listed = ", ".join(list(dict.fromkeys(missing))[:5])
+        roots = ", ".join(f"{key}={os.environ.get(key, '')}" for key in _ROOTS)
         raise RobotError(
-            f"{'; '.join(listed)}; looked in {', '.join(roots)}, and above {home}"
+            f"missing files: {listed}; looked in {roots}, and above {home}"
         )
 
 
