@@ -7,44 +7,42 @@ takes turns in short blocks, medians are taken, and the ratio is what counts.
 from __future__ import annotations
 
 import os
-import shutil
 import statistics
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass
-from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+import numpy as np
+import torch
 from tqdm import tqdm
 
-from ir_maniskill import bench_blocks
-from ir_maniskill.bench_blocks import (
-    BLOCKS,
-    ENVS_EACH,
-    EPISODE,
-    OURS,
-    SIDE,
-    Block,
-    Stepping,
-    actions,
-    make,
-    make_many,
-    stepping_many,
-    timed,
-)
 from ir_maniskill.checks import require
+from ir_maniskill.environment.vector import make_vec
 from ir_maniskill.evaluation.evaluate import machine, versions
+from ir_maniskill.training.config import CONFIGS
+from ir_maniskill.training.run_folder import whole_rows
+from ir_maniskill.training.train import train
 
-ROOT = Path(__file__).parents[1]
+OURS = "NaoTouchCubeTriangle-v1"
 PEER = "mani_skill.envs:UnitreeG1PlaceAppleInBowl-v1"
 """A humanoid task of ManiSkill's; it too looks through two cameras at 128 x 128."""
 BARE = "physics and drawing alone"
+SHADER = "unlit"
+"""Shader pack of all pictures: the cheapest."""
+SIDE = 128
+"""Height and width of the pictures that are compared [pixel]."""
+EPISODE = 32
+"""Steps of an episode of ours."""
+ENVS_EACH = 8
+"""Envs of each worker process, as in a training with default settings on two cores."""
+Block = Callable[[], float]
+"""Makes some steps and returns how long one of them took [s]."""
 
 
 @dataclass(frozen=True)
@@ -112,12 +110,8 @@ def run(seconds: float = 10.0, quick: bool = False) -> Report:
         learning(updates=1 if quick else 3),
     )
     rows = tuple(chain.from_iterable(tqdm(jobs, desc="bench")))
-    return Report(facts(), rows)
-
-
-def facts() -> dict[str, Any]:
-    """Return where and with what was measured."""
-    return {**machine(), "load": round(os.getloadavg()[0], 1), **versions()}
+    load = {"load": round(os.getloadavg()[0], 1)}
+    return Report(machine() | load | versions(), rows)
 
 
 def one_env(obs_mode: str, seconds: float, peer: bool) -> Iterator[Row]:
@@ -142,9 +136,11 @@ def many_envs(seconds: float) -> Iterator[Row]:
     """Compare a worker process on every core with one."""
     cores = len(os.sched_getaffinity(0))
     total = ENVS_EACH * cores
+    cameras = {"width": 32, "height": 64, "shader_pack": SHADER}
+    kwargs: dict[str, Any] = {"obs_mode": "rgb", "sensor_configs": cameras}
     with (
-        closing(make_many(total, cores)) as envs,
-        closing(make_many(ENVS_EACH, 1)) as few,
+        closing(make_vec(OURS, total, num_workers=cores, **kwargs)) as envs,
+        closing(make_vec(OURS, ENVS_EACH, num_workers=1, **kwargs)) as few,
     ):
         blocks = {"all": stepping_many(envs), "one": stepping_many(few)}
         speed = in_turn(blocks, seconds)
@@ -154,106 +150,89 @@ def many_envs(seconds: float) -> Iterator[Row]:
 
 def learning(updates: int) -> Iterator[Row]:
     """Compare training with collecting alone, by the times that a run logs."""
-    rows = list(bench_blocks.training(updates))
-    alone = 1 / statistics.median(collect for collect, _ in rows)
-    speed = 1 / statistics.median(map(sum, rows))
-    yield Row("training, preset `default`", speed, "its envs and actions alone", alone)
-
-
-# -- Beside another revision -----------------------------------------------------------
-
-
-def against(revision: str, seconds: float = 10.0) -> Report:
-    """Compare this tree with another revision, in processes that take turns.
-
-    Args:
-        revision: What git calls it.
-        seconds: How long each comparison goes on, five turns at least [s].
-
-    Raises:
-        ValueError: There is no such revision, or this is no clone of the repository.
-        RuntimeError: One of them cannot do what is compared.
-    """
-    rows = []
-    with checkout(revision) as (tree, blocks), ExitStack() as stack:
-        ours, theirs = [stack.enter_context(side(t, blocks)) for t in (ROOT, tree)]
-        for name in tqdm(BLOCKS, desc="bench"):
-            turns = {"ours": partial(ours, name), "theirs": partial(theirs, name)}
-            speed = in_turn(turns, seconds, least=5)
-            rows.append(Row(name, speed["ours"], revision, speed["theirs"]))
-    return Report(facts(), tuple(rows))
-
-
-@contextmanager
-def checkout(revision: str) -> Iterator[tuple[Path, Path]]:
-    """Check a revision out for a while; return where, and what makes its blocks."""
-    git = ["git", "-C", str(ROOT), "worktree"]
+    steps = CONFIGS["default"].steps_per_update
     with tempfile.TemporaryDirectory() as folder:
-        tree = Path(folder) / "tree"
-        add = [*git, "add", "--detach", str(tree), revision]
-        done = subprocess.run(add, capture_output=True, text=True)
-        expected = f"a revision in a clone of the repository: {done.stderr.strip()}"
-        require(done.returncode == 0, "against", revision, expected)
-        try:
-            for name in ("assets", "tasks"):  # 0.1 was installed with them elsewhere
-                if not (inner := tree / "ir_maniskill" / name).exists():
-                    inner.symlink_to(tree / name)
-            # Beside it, since a program's folder is searched for modules first.
-            yield tree, Path(shutil.copy(Path(bench_blocks.__file__), folder))
-        finally:
-            subprocess.run([*git, "remove", "--force", str(tree)], capture_output=True)
-
-
-@contextmanager
-def side(tree: Path, blocks: Path) -> Iterator[Callable[[str], float]]:
-    """Return what times a step of a block, by its name, in a process of that tree."""
-    with subprocess.Popen(
-        [sys.executable, str(blocks)],
-        cwd=tree,  # its worker processes look for modules there first
-        env=os.environ | {"PYTHONPATH": str(tree)},
-        stdin=(pipe := subprocess.PIPE),
-        stdout=pipe,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    ) as process:
-        assert process.stdin is not None and process.stdout is not None
-        ask, answers = process.stdin, process.stdout
-
-        def seconds(name: str) -> float:
-            print(name, file=ask, flush=True)
-            answer = answers.readline()
-            try:
-                return float(answer)
-            except ValueError:
-                raise RuntimeError(f"{name}: {answer or 'the process died'}") from None
-
-        yield seconds
+        train(OURS, out=folder, total_steps=updates * steps, eval_episodes=3)
+        rows = whole_rows(Path(folder) / "metrics.csv")
+    collect = [float(row["time/collect"]) for row in rows]  # [s] for each update
+    both = [float(row["time/update"]) + t for row, t in zip(rows, collect, strict=True)]
+    alone, speed = (steps / statistics.median(times) for times in (collect, both))
+    yield Row("training, preset `default`", speed, "its envs and actions alone", alone)
 
 
 # -- Timing ----------------------------------------------------------------------------
 
 
-def in_turn(
-    blocks: Mapping[str, Block], seconds: float, least: int = 3
-) -> dict[str, float]:
+def in_turn(blocks: Mapping[str, Block], seconds: float) -> dict[str, float]:
     """Run the blocks in turn and return the median speed of each [steps/s].
 
     Whatever else runs on the machine slows all of them alike, so that ratios stay.
 
     Args:
-        blocks: What to compare, by name.
+        blocks: What to compare, by name; each runs three times at least.
         seconds: How long to go on.
-        least: How often every block runs at least.
     """
     samples: dict[str, list[float]] = {name: [] for name in blocks}
     end = time.perf_counter() + seconds
-    while min(map(len, samples.values())) < least or time.perf_counter() < end:
+    while min(map(len, samples.values())) < 3 or time.perf_counter() < end:
         for name, block in blocks.items():
             samples[name].append(block())
     return {name: 1 / statistics.median(times) for name, times in samples.items()}
 
 
-# -- What a step costs at least --------------------------------------------------------
+def timed(work: Callable[[], Any], steps: int) -> float:
+    """Return how long a step of this work takes [s]."""
+    start = time.perf_counter()
+    work()
+    return (time.perf_counter() - start) / steps
+
+
+# -- Blocks ----------------------------------------------------------------------------
+
+
+def make(task: str, obs_mode: str) -> Any:
+    """Make one env on the CPU and step it once, which compiles its shaders."""
+    cameras = {"width": SIDE, "height": SIDE, "shader_pack": SHADER}
+    kwargs: dict[str, Any] = {"sim_backend": "physx_cpu", "render_backend": "cpu"}
+    kwargs["sensor_configs"] = cameras if obs_mode == "rgb" else {}
+    env = gym.make(task, obs_mode=obs_mode, **kwargs)
+    env.reset(seed=0)
+    env.step(actions(env, 1)[0])
+    return env
+
+
+def actions(env: Any, steps: int) -> np.ndarray:
+    """Return pinned random actions [T, J]."""
+    env.action_space.seed(0)
+    return np.stack([env.action_space.sample() for _ in range(steps)])
+
+
+class Stepping:
+    """A block that steps one env, episode after episode; resets are not timed."""
+
+    def __init__(self, env: Any, steps: int) -> None:
+        """Plan the actions of an episode, of which a block makes some steps."""
+        length = env.spec.max_episode_steps or EPISODE
+        self._env, self._steps, self._done = env, steps, length
+        self._plan = actions(env, length)
+
+    def __call__(self) -> float:
+        """Return the time of a step [s]."""
+        if self._done + self._steps > len(self._plan):
+            self._env.reset()
+            self._done = 0
+        part = self._plan[self._done : self._done + self._steps]
+        self._done += self._steps
+        return timed(lambda: [self._env.step(action) for action in part], self._steps)
+
+
+def stepping_many(envs: Any) -> Block:
+    """Return a block that steps all envs of a vector for an episode."""
+    plan = torch.rand(EPISODE, *envs.action_space.shape) * 2 - 1
+    envs.reset(seed=0)
+    return lambda: timed(
+        lambda: [envs.step(action) for action in plan], EPISODE * envs.num_envs
+    )
 
 
 class BareLoop:

@@ -312,17 +312,12 @@ class Bench:
     """How long each comparison goes on [s]."""
     quick: bool = False
     """Measure as briefly as possible, and without ManiSkill's humanoid task."""
-    against: str | None = None
-    """Measure this clone of the repository beside one of its revisions instead."""
 
     def run(self) -> None:
         """Print the table, and write it."""
         if self.json is not None:
             require_writable(self.json)
-        if self.against is not None:
-            report = bench.against(self.against, self.seconds)
-        else:
-            report = bench.run(self.seconds, self.quick)
+        report = bench.run(self.seconds, self.quick)
         print(report)
         if self.json is not None:
             write_json(self.json, report.as_dict())

@@ -8,7 +8,6 @@ cannot be imported: ``python -I ir_maniskill/doctor.py``.
 
 from __future__ import annotations
 
-import argparse
 import importlib.metadata
 import json
 import os
@@ -16,7 +15,7 @@ import platform
 import re
 import subprocess
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -136,9 +135,7 @@ def diagnose() -> Diagnosis:
 
 
 def require_vulkan() -> None:
-    """Raise one clear error if SAPIEN finds no Vulkan device to render with.
-
-    Cheap where there is one: it asks SAPIEN in this process.
+    """Raise one clear error if SAPIEN finds no Vulkan device; quick if there is one.
 
     Raises:
         RuntimeError: No device; the message holds the commands that install one.
@@ -234,18 +231,13 @@ def _version(distribution: str) -> str | None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Print the diagnosis; return 0 if this machine can render, else 1."""
-    parser = argparse.ArgumentParser(prog="doctor", description=diagnose.__doc__)
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--commands", action="store_true", help="only what to run")
-    options = parser.parse_args(arguments)
+    """Print the diagnosis; return 0 if this machine can render, else 1.
+
+    With `--commands` it prints only the shell commands to run.
+    """
     diagnosis = diagnose()
-    if options.commands:
-        print("\n".join(diagnosis.remedy))
-    elif options.json:
-        print(json.dumps({**asdict(diagnosis), "healthy": diagnosis.healthy}, indent=2))
-    else:
-        print(diagnosis)
+    commands = "--commands" in (sys.argv[1:] if arguments is None else arguments)
+    print("\n".join(diagnosis.remedy) if commands else diagnosis)
     return 0 if diagnosis.healthy else 1
 
 

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from ir_maniskill import bench, bench_blocks, cli
+from ir_maniskill import bench, cli
 from ir_maniskill.bench import Report, Row
-from ir_maniskill.training import train as training
 from ir_maniskill.training.config import CONFIGS
 
 
@@ -47,7 +46,7 @@ class FakeEnv:
 
 def test_resets_are_not_timed(monkeypatch):
     env = FakeEnv()
-    monkeypatch.setattr(bench_blocks, "actions", lambda _, steps: list(range(steps)))
+    monkeypatch.setattr(bench, "actions", lambda _, steps: list(range(steps)))
     env.spec = type("Spec", (), {"max_episode_steps": 5})
     block = bench.Stepping(env, 2)
     assert max(block(), block(), block()) < 0.05
@@ -78,48 +77,21 @@ def test_bare_loop_drives_the_same_motion(multi_env):
 
 
 def test_training_is_timed_by_what_it_logs(monkeypatch):
-    def train(config):
-        assert config.total_steps == 3 * config.steps_per_update
-        rows = ["steps,time/collect,time/update", "1,2,2", "2,4,4", "3,9,9"]
-        (Path(config.out) / "metrics.csv").write_text("\n".join(rows) + "\n")
-
-    monkeypatch.setattr(training, "train", train)
     steps = CONFIGS["default"].steps_per_update
+
+    def train(task, *, out, total_steps, eval_episodes):
+        assert (task, total_steps) == (bench.OURS, 3 * steps)
+        rows = ["steps,time/collect,time/update", "1,2,2", "2,4,4", "3,9,9"]
+        (Path(out) / "metrics.csv").write_text("\n".join(rows) + "\n")
+
+    monkeypatch.setattr(bench, "train", train)
     (row,) = bench.learning(updates=3)
     assert (row.speed, row.speed_beside) == (steps / 8, steps / 4)  # medians
-
-
-BLOCKS = """
-import os, sys
-for line in sys.stdin:
-    name = line.strip()
-    answer = 0.5 if name == "half" else repr(ValueError(os.environ["PYTHONPATH"]))
-    print(answer, flush=True)
-"""
-
-
-def test_a_side_times_its_own_trees_blocks_and_says_what_went_wrong(tmp_path):
-    (tmp_path / "blocks.py").write_text(BLOCKS)
-    with bench.side(tmp_path, tmp_path / "blocks.py") as seconds:
-        assert seconds("half") == 0.5
-        with pytest.raises(RuntimeError, match=f"other: ValueError.*{tmp_path}"):
-            seconds("other")
-
-
-@pytest.mark.skipif(not (bench.ROOT / ".git").exists(), reason="no clone")
-def test_a_revision_is_checked_out_for_a_while():
-    with bench.checkout("HEAD") as (tree, blocks):
-        assert (tree / "ir_maniskill" / "tasks" / "__init__.py").exists()
-        assert blocks.read_text() == Path(bench_blocks.__file__).read_text()
-    assert not tree.exists()
-    with pytest.raises(ValueError, match="against: got 'nowhere', expected a revision"):
-        bench.against("nowhere")
 
 
 def test_command_line_reads_its_options():
     command = cli.parse(["bench", "--seconds", "2", "--quick", "--json", "b.json"])
     assert command == cli.Bench(json=Path("b.json"), seconds=2.0, quick=True)
-    assert cli.parse(["bench", "--against", "HEAD"]) == cli.Bench(against="HEAD")
 
 
 def test_command_line_refuses_impossible_durations(capsys):

@@ -1,4 +1,3 @@
-import json
 import subprocess
 import sys
 
@@ -35,16 +34,15 @@ def test_this_machine_renders_and_says_through_what():
 def test_without_a_driver_the_probe_reports_it_and_the_exit_code_is_1():
     """Run as the set-up does: as a file, importing nothing of the package."""
     done = subprocess.run(
-        [sys.executable, "-I", doctor.__file__, "--json"],
+        [sys.executable, "-I", doctor.__file__],
         env={"VK_ICD_FILENAMES": "/nowhere", "VK_DRIVER_FILES": "/nowhere", "PATH": ""},
         capture_output=True,
         text=True,
         timeout=120,
     )
-    data = json.loads(done.stdout)
-    assert done.returncode == 1 and data["healthy"] is False
-    assert "rendering device" in data["render_error"]
-    assert data["remedy"] or data["advice"]
+    assert done.returncode == 1
+    assert "FAILS" in done.stdout and "rendering device" in done.stdout
+    assert "mesa-vulkan-drivers" in done.stdout or "Vulkan driver" in done.stdout
 
 
 def test_a_crashing_probe_is_reported_not_suffered(monkeypatch):

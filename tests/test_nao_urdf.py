@@ -104,19 +104,15 @@ def numbers(robot: ET.Element, path: str, attribute: str) -> np.ndarray:
     return np.array(element.attrib[attribute].split(), dtype=float)
 
 
-def test_an_official_description_becomes_one_like_ours(urdf: Path) -> None:
+def test_an_official_description_gets_what_it_leaves_out(urdf: Path) -> None:
     theirs = ET.fromstring(adapt(urdf, str(URDF_PATH)))
     ours = ET.parse(URDF_PATH).getroot()
-    for tag in ("joint", "link"):
-        names = [[x.attrib["name"] for x in r.findall(tag)] for r in (theirs, ours)]
-        assert sorted(names[0]) == sorted(names[1])
-    assert not theirs.findall(".//mimic")
+    assert theirs.find("link[@name='torso']") is not None
+    assert theirs.find("link[@name='base_link']") is None  # what the torso hangs on
+    assert theirs.find("link[@name='Head']") is not None
     for name in JOINTS:
         at = f"joint[@name='{name}']"
         assert theirs.find(at).get("type") == "revolute"
-        for end in ("parent", "child"):
-            part = f"{at}/{end}"
-            assert theirs.find(part).get("link") == ours.find(part).get("link")
         values = [("origin", "xyz"), ("origin", "rpy"), ("axis", "xyz")]
         values += [("limit", x) for x in ("lower", "upper", "effort", "velocity")]
         for part, attribute in values:
@@ -124,30 +120,8 @@ def test_an_official_description_becomes_one_like_ours(urdf: Path) -> None:
                 numbers(r, f"{at}/{part}", attribute) for r in (theirs, ours)
             )
             np.testing.assert_allclose(got, wanted, atol=2e-5, err_msg=f"{at}/{part}")
-
-
-def test_what_does_not_move_is_merged_in_our_posture(urdf: Path) -> None:
-    theirs = ET.fromstring(adapt(urdf, str(URDF_PATH)))
-    ours = ET.parse(URDF_PATH).getroot()
-    for name in (x.attrib["name"] for x in ours.findall("link")):
-        at = f"link[@name='{name}']/inertial"
-        values = [("origin", "xyz"), ("mass", "value")]
-        values += [("inertia", key) for key in MOMENTS]
-        for part, attribute in values:
-            got, wanted = (
-                numbers(r, f"{at}/{part}", attribute) for r in (theirs, ours)
-            )
-            np.testing.assert_allclose(got, wanted, rtol=1e-4, atol=1e-8)
-
-
-def test_shapes_of_what_does_not_move_come_along(urdf: Path) -> None:
-    box = '<link name="l_gripper"><collision><origin xyz="0 0 0.01"/><geometry>'
-    box += '<box size="1 1 1"/></geometry></collision>'
-    edited(urdf, '<link name="l_gripper">', box)
-    at = "link[@name='l_wrist']/collision/origin"
-    theirs = ET.fromstring(adapt(urdf, str(URDF_PATH)))
-    got = numbers(theirs, at, "xyz")  # LHand stands at (0.05775, 0, -0.01231)
-    np.testing.assert_allclose(got, (0.05775, 0, -0.00231), atol=1e-12)
+    for link, mass in (("LFinger12_link", 0.004), ("torso", 1.04956)):
+        assert numbers(theirs, f"link[@name='{link}']/inertial/mass", "value") == mass
 
 
 def test_limits_of_a_finger_that_has_some_are_kept(urdf: Path) -> None:
@@ -209,8 +183,9 @@ def test_missing_files_are_named_once_with_where_they_were_sought(
     with pytest.raises(RobotError) as error:
         adapt(urdf, str(URDF_PATH))
     message = str(error.value)
-    assert message.count(f"missing meshes: {MESHES}/phalanx.stl;") == 1
-    assert "missing textures: paint.png;" in message and "phalanx.dae" not in message
+    assert message.count(f"{MESHES}/phalanx.stl") == 1
+    assert "missing files: " in message and "paint.png" in message
+    assert "phalanx.dae" not in message
     assert "ROS_PACKAGE_PATH=/opt/packages" in message
     assert str(urdf) in message and str(urdf.parent) in message
 
@@ -230,7 +205,6 @@ def test_missing_files_are_named_once_with_where_they_were_sought(
             "LFinger12, LFinger13",
         ),
         ('<child link="RForeArm" />', "", "RElbowRoll.*missing <child>"),
-        ('rpy="1.8862 0.976662 0.264067"', 'rpy="1 2"', "expected three numbers"),
         ('value="1.04956"', 'value="nan"', "torso.*got 'nan', expected a finite"),
         ('<link name="torso">', "<link>", "a <link> has no name"),
         ('upper="2.08567"', 'upper="-3"', "'LShoulderPitch'.*upper=\"-3\".*lower < up"),
@@ -293,16 +267,6 @@ def test_a_declaration_need_not_come_first(urdf: Path) -> None:
     declared = f'\ufeff \n<?xml version="1.0" encoding="utf-8"?>{urdf.read_text()}'
     urdf.write_text(declared, encoding="utf-8")
     assert adapt(urdf, str(URDF_PATH)).startswith("<robot")
-
-
-def test_fingers_that_cannot_touch_are_named(urdf: Path) -> None:
-    robot = ET.parse(urdf)
-    for name in ("LFinger11_link", "RThumb2_link"):
-        thing = robot.getroot().find(f"link[@name='{name}']")
-        thing.remove(thing.find("collision"))
-    robot.write(urdf)
-    with pytest.raises(RobotError, match="LFinger11_link, RThumb2_link; touch"):
-        adapt(urdf, str(URDF_PATH))
 
 
 def test_a_finger_whose_mesh_is_a_text_is_named(urdf: Path) -> None:

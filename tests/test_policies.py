@@ -1,5 +1,6 @@
 """The shipped policies load, say how good they are, and are."""
 
+import json
 from contextlib import closing
 from importlib.resources import files
 from pathlib import Path
@@ -53,6 +54,19 @@ def test_a_policy_of_0_1_acts_as_it_did(path: Path) -> None:
     actions = agent.policy(fixed_states())  # [20, 26], up to 1
     expected = torch.from_numpy(recorded[path.stem])
     assert torch.allclose(actions, expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("path", [p for p in SHIPPED if "Touch" in p.stem])
+def test_the_results_page_has_the_figures_of_a_shipped_policy(path: Path) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "results.md").read_text()
+    figures = json.loads(path.with_suffix(".json").read_text())
+    for sentence, score in figures["instructions"].items():
+        cells = [f"`{path.stem}`", sentence.split()[-2]]
+        for name in ("success", "exclusive"):
+            low, high = score[f"{name}_interval"]
+            cells += [f"{100 * score[name]:.1f}% [{100 * low:.1f}, {100 * high:.1f}]"]
+        cells += [f"{score['holding']:.0%}", f"{score['right_fingers']:.1f}"]
+        assert "| " + " | ".join(cells) + " |" in page
 
 
 @pytest.mark.render

@@ -1,4 +1,4 @@
-"""Where bodies are and how fast, read at once: a ManiSkill `Pose` for each is slow.
+"""Poses and velocities of many bodies at once: a ManiSkill `Pose` for each is slow.
 
 Legend: N envs, B bodies.
 """

@@ -240,7 +240,7 @@ class ProcessVectorEnv(VectorEnv):
             )
 
     def _send(self, name: str, arguments: list) -> None:
-        # Pickled here: pipes would pass each of torch's tensors as a file descriptor.
+        # Pickled here: `send` would pass each tensor as a file descriptor.
         messages = [pickle.dumps((name, argument)) for argument in arguments]
         self._busy = True
         for index, message in enumerate(messages):

@@ -1,9 +1,9 @@
 """Senses: the one list of what is perceived, and the state s_t made of it.
 
-The env observes what the terms of this list measure, `StateStack` stacks them, and the
-agent's encoders read those that `AgentConfig.senses` names. A sense of one's own is one
-`register(Term(...))`, in a module that can be imported, so that worker processes get it
-too. Cameras are the env's: all that give colors are seen.
+The env observes what these terms measure, `StateStack` stacks them, and the agent's
+encoders read those that `AgentConfig.senses` names. To add a sense, call
+`register(Term(...))` in a module that worker processes can import. All cameras of the
+env that see colors are used.
 
 Legend: N envs, S stacked observations, K cameras, H x W pixels, J joints, F fingers,
 C objects, L tokens, B bytes, P privileged numbers.
@@ -25,8 +25,8 @@ Observation = dict[str, Any]
 """o_t of N envs in an image or state_dict mode, nested as ManiSkill does."""
 
 State = dict[str, Tensor]
-"""s_t of N envs by the names of the terms; those of the simulator's own state are side
-by side in "privileged" [N, P]."""
+"""s_t of N envs by the names of the terms. Those that only the simulator knows are
+joined in "privileged" [N, P]."""
 
 Encoder = Literal["language", "vision", "body", "privileged", "none"]
 Part = Literal["agent", "extra"]
@@ -41,24 +41,24 @@ class Term:
     name: str
     """Its name in both."""
     encoder: Encoder
-    """What of the agent reads it: the Language System; the Perceptual System's vision
-    or its body senses; "privileged", the same but standardized, for what only the
-    simulator knows; or "none", for what a loss compares with."""
+    """What reads it: the Language System; the Perceptual System's vision or its body
+    senses; "privileged", the same but standardized, for what only the simulator knows;
+    "none": a loss only."""
     shape: str
     """What it is for each env, e.g. "J" or "K, H, W, 3"."""
     measure: Measure | None = None
-    """Returns it [N, shape], of the env and its info; None: the robot gives it with its
+    """Returns it [N, shape] from the env and its info; None: it comes with the robot's
     proprioception, or `read` finds it."""
     sense: str = ""
     """What `AgentConfig.senses` calls it; "" is its name."""
     stacked: bool = False
     """Whether the state has its last S values [N, S, shape], the newest first."""
     part: Part = "extra"
-    """Where the observation has it; of "agent" the info is not known yet."""
+    """Part of the observation it is in; terms of "agent" get no info."""
     asked: bool = False
-    """Whether only envs have it that are asked to: `gym.make(ID, observe=(name,))`."""
+    """Whether it is observed on request only: `gym.make(ID, observe=(name,))`."""
     read: Callable[[Observation], Tensor | None] | None = None
-    """Finds it in an observation, if it is not simply there."""
+    """Computes it from an observation; None: it stands there under its name."""
 
     def find(self, obs: Observation) -> Tensor | None:
         """Return it from an observation; None: it is not there."""
@@ -68,9 +68,9 @@ class Term:
 
 
 def cameras(obs: Observation) -> tuple[str, ...]:
-    """Return the names of the K cameras that see colors, as they are in "images".
+    """Return the names of the K cameras that see colors, in the order of "images".
 
-    Their order follows from the names alone: dicts may be sorted on their way.
+    The order depends on the names alone: dicts may be sorted on their way here.
     """
     sensors = obs.get("sensor_data", {})
     named = (name for name, seen in sensors.items() if "rgb" in seen)
@@ -145,10 +145,10 @@ def available() -> tuple[str, ...]:
 
 
 def register(term: Term) -> Term:
-    """Add a sense of one's own, before envs are made; again: nothing happens.
+    """Add a sense, before envs are made; adding it again does nothing.
 
     Raises:
-        ValueError: Its name is taken, or no encoder for all comers would read it.
+        ValueError: Its name is taken, or its encoder is not "body" or "privileged".
     """
     if term in _TERMS:
         return term
@@ -164,15 +164,15 @@ def register(term: Term) -> Term:
 
 
 def askable() -> tuple[str, ...]:
-    """Return the names of the terms that only envs have which are asked to."""
+    """Return the names of the terms that are observed on request only."""
     return tuple(term.name for term in _TERMS if term.asked)
 
 
 def require_askable(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the names of terms that an env is asked to observe.
+    """Return the names as a tuple.
 
     Raises:
-        ValueError: There is no such term to ask for.
+        ValueError: One is not `askable`.
     """
     many = isinstance(names, Iterable) and not isinstance(names, str)
     if not many or not set(names) <= set(askable()):
@@ -181,12 +181,12 @@ def require_askable(names: Iterable[str]) -> tuple[str, ...]:
 
 
 def registered() -> tuple[Term, ...]:
-    """Return the senses that were registered, for a worker process to do so too."""
+    """Return the senses that users added, for worker processes to add them too."""
     return tuple(_TERMS[_OURS:])
 
 
 def observe(env: Any, part: Part, info: Info) -> dict[str, Tensor]:
-    """Return what the terms of a part of the observation measure in an env."""
+    """Return one part of an env's observation: what its terms measure."""
     mode = env.obs_mode_struct
     return {
         term.name: term.measure(env, info)
@@ -199,7 +199,7 @@ def observe(env: Any, part: Part, info: Info) -> dict[str, Tensor]:
 
 
 def entries(senses: Iterable[str]) -> dict[str, Encoder]:
-    """Return which entries of the state these senses are, and what reads each."""
+    """Return the state's entries that these senses name, and what reads each."""
     found: dict[str, Encoder] = {}
     for sense in senses:
         for term in _TERMS:
@@ -254,7 +254,7 @@ def _padded(rows: list[list[int]], length: int, dtype: torch.dtype) -> Tensor:
 
 
 def flatten(obs: Observation) -> State:
-    """Return one observation o_t as a flat dict, what is not there left out."""
+    """Return one observation o_t as a flat dict of the terms it has."""
     state, privileged = {}, []
     for term in _TERMS:
         value = term.find(obs)
@@ -268,7 +268,7 @@ def flatten(obs: Observation) -> State:
 
 
 def felt(obs: Observation) -> dict[str, Any]:
-    """Return the numbers that the first env's body and simulator give [n] each."""
+    """Return the body's and the privileged numbers of the first env [n] each."""
     read = {t.name for t in _TERMS if t.encoder == "body"} | {"privileged"}
     state = flatten(obs)
     return {

@@ -56,14 +56,14 @@ def record_of(tree: Tree) -> np.dtype:
 
 
 def reserve(size: int) -> IO[bytes]:
-    """Return a file in memory, without a name: it goes with the last who has it open.
+    """Return a file in memory without a name: it is gone when the last one closes it.
 
     Raises:
         OSError: There is not as much memory; the message says what to do.
     """
     try:
         file = tempfile.TemporaryFile(dir=FOLDER)  # noqa: SIM115
-        # Not reserved, memory that runs out later would kill whoever writes (SIGBUS).
+        # Reserved now: memory that runs out later kills whoever writes (SIGBUS).
         os.posix_fallocate(file.fileno(), 0, size)
     except OSError as error:
         message = (

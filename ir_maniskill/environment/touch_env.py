@@ -181,7 +181,7 @@ class TouchEnv(RenderedEnv):
         self._success_once = torch.zeros(count, dtype=torch.bool, device=device)
         self._wrong_once = torch.zeros_like(self._success_once)
         self._start = torch.zeros(count, task.slots, 7, device=device)
-        # What a pose is divided by to be one at NAO's scale.
+        # Poses are divided by this to be at NAO's scale.
         self._size = torch.tensor([self.agent.scale] * 3 + [1.0] * 4, device=device)
 
     # -- Episode ---------------------------------------------------------------------
@@ -214,8 +214,8 @@ class TouchEnv(RenderedEnv):
         self._begin(env_idx)
 
     def _begin(self, env_idx: Tensor) -> None:
-        """Forget what was reached and fouled, and look up what sentences refer to."""
-        # The last step's info, which others may keep, holds these very tensors.
+        """Forget successes and fouls, and look up what sentences refer to."""
+        # Not in place: the info of the last step holds these very tensors.
         self._success_once = self._success_once.index_fill(0, env_idx, False)
         self._wrong_once = self._wrong_once.index_fill(0, env_idx, False)
         self._stage = self._stage.index_fill(0, env_idx, 0)
@@ -280,7 +280,7 @@ class TouchEnv(RenderedEnv):
             raise
 
     def _tell(self, env_idx: Tensor, said: Sequence[Instruction]) -> Tensor:
-        """Return where the Instructional Set has what envs are told [b] int64."""
+        """Return the Instructional Set's rows of what envs are told [b] int64."""
         own, count = self.instructional_set.instructions, len(self.instructional_set)
         found = {instruction: row for row, instruction in enumerate(own[:count])}
         envs = env_idx.tolist()
@@ -356,9 +356,9 @@ class TouchEnv(RenderedEnv):
         return Snapshot(*self._scene().values())
 
     def _scene(self) -> Snapshot:
-        """Return the same, of which some is read from the simulator when it is asked.
+        """Return a snapshot whose fields are partly read when they are first used.
 
-        It is for this very step: later the simulator would say something else.
+        Use it within this step only: later the simulator would say something else.
         """
         robot, table = self.agent, self.table
         return Snapshot(
@@ -373,7 +373,7 @@ class TouchEnv(RenderedEnv):
         )
 
     def judged(self) -> Snapshot:
-        """Return what `evaluate` judged, at the stage of the goals that it brought."""
+        """Return the snapshot that `evaluate` judged, at the stage it led to."""
         return self._judged.at_stage(self._stage)
 
     def get_info(self) -> dict[str, Tensor]:
@@ -384,7 +384,7 @@ class TouchEnv(RenderedEnv):
         return info
 
     def evaluate(self) -> dict[str, Tensor]:
-        """Measure the goals; what a step brought is added to the episode once.
+        """Measure the goals; a step counts for the episode once, however often asked.
 
         Returns:
             Per env [N]: `right_fingers` and `wrong_fingers` (int64): fingers that touch
@@ -450,7 +450,7 @@ class TouchEnv(RenderedEnv):
     # -- State -----------------------------------------------------------------------
 
     def _task_state(self) -> dict[str, Tensor]:
-        """Return what of the task is state beside bodies and joint targets [N, ...]."""
+        """Return the task's own state, beside bodies and joint targets [N, ...]."""
         return {
             "instruction_index": self.instruction_index.float()[:, None],
             "told": self.instructional_set.text[-self.num_envs :].float(),

@@ -27,13 +27,13 @@ ENDS = ("terminated", "truncated")
 
 def work(pipe: Connection, environ: dict[str, str]) -> None:
     """Run a worker: answer commands until the parent closes the pipe or is gone."""
-    # The server that forks workers has those of the time when it was started.
+    # The fork server still has the environment variables of when it was started.
     os.environ.clear()
     os.environ.update(environ)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     torch.set_num_threads(1)
-    # Mesa reads it when the first picture is asked for: workers keep all cores busy, so
-    # that drawing on further threads costs more than it gains.
+    # Mesa reads it at the first picture. Workers keep all cores busy, so more threads
+    # for drawing would cost more than they gain.
     os.environ.setdefault("LP_NUM_THREADS", "0")
     worker = _Worker(pipe)
     with contextlib.suppress(EOFError, OSError):
@@ -62,13 +62,13 @@ class _Worker:
             senses.register(term)
         register(experiment)
         self._envs = [gym.make(experiment.id, **kwargs) for _ in self._rows]
-        # ManiSkill collects garbage whenever it rebuilds a scene, which seeded resets
-        # do; what is alive now stays alive, so there is no point in looking at it.
+        # ManiSkill collects garbage whenever it rebuilds a scene, as seeded resets do.
+        # What is alive now stays alive: leave it out of the search.
         gc.freeze()
         return self._description() if self._rows[0] == 0 else None
 
     def _description(self) -> tuple[np.dtype, gym.Space, gym.Space]:
-        """Return the record of all that is shared of an env, and its spaces."""
+        """Return the layout of an env's row in shared memory, and its spaces."""
         env = self._envs[0]
         obs, info = env.reset(seed=0)
         sample = {"obs": obs, "info": info, "final_obs": obs, "final_info": info}

@@ -33,8 +33,8 @@ Policy = Callable[[State], Tensor]
 """Maps the state s_t of N envs to their actions [N, 26] in [-1, 1]."""
 
 Player = Callable[[Observation, Tensor | None], Tensor]
-"""Maps what N envs observe to their actions, and keeps what it must remember: `done`
-[N] bool says in which envs an episode begins; None: in all."""
+"""Maps observations of N envs to actions, and keeps its own history: `done` [N] bool
+says in which envs an episode begins; None: in all."""
 
 EVALUATION_SEED = 2_000_000
 """Seed of the first episode that figures are made of, apart from those of training and
@@ -198,9 +198,9 @@ def evaluate_policy(
 def player_of(policy: Policy, frames: int) -> Player:
     """Return a policy as one that gets observations, of which it stacks S.
 
-    On the CPU it acts on one env after another. How a matrix product is rounded depends
-    on the number of rows, and contacts make much of little: alone, an env is acted on
-    alike whatever others are beside it.
+    On the CPU it acts on one env after another: how a matrix product is rounded depends
+    on the number of rows, and contacts amplify such differences. So an episode does not
+    depend on how many envs there are.
     """
     stack = StateStack(frames)
 

@@ -1,13 +1,9 @@
-"""Learning curves: how runs got better, drawn from what they logged.
-
-Legend: R runs, P points.
-"""
+"""Pictures of figures: how a run got better, and what an audit found."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from itertools import cycle, groupby
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +23,6 @@ SHARES = (
     ("holding", "steps in which it holds", "#9aa3b2"),
 )
 """What metrics.csv and evaluations.csv have shares of, its name and its color."""
-CURVE_COLORS = ("#2f6fde", "#d9730d", "#22a06b", "#8250df", "#9aa3b2")
-"""Colors of compared curves, in turn."""
-COMPARED = (
-    ("eval/success", "Success [%]", 100),
-    ("eval/exclusive", "Exclusive [%]", 100),
-    ("eval/right_fingers", "Fingers on the object", 1),
-)
-"""Columns of evaluations.csv in which runs are compared, their names and scales."""
 INK = "#24292f"
 """Axes and text."""
 
@@ -79,92 +67,9 @@ def learning_curve(run: Path, out: Path | None = None) -> Path:
         handlelength=1.2,
         columnspacing=1.1,
     )
-    line = _points(metrics, "train/return")
-    returns.plot(*line, color=CURVE_COLORS[0], linewidth=1.8)
+    returns.plot(*_points(metrics, "train/return"), color=SHARES[0][2], linewidth=1.8)
     returns.set_ylabel("Return of an episode")
     return _save(figure, out or run / "learning_curve.png")
-
-
-@dataclass(frozen=True)
-class Curve:
-    """Runs that differ by chance only, mostly by their seeds."""
-
-    label: str
-    """What the legend calls them."""
-    runs: Sequence[Sequence[Row]]
-    """Rows of the evaluations.csv of each run."""
-
-    def over_steps(self, column: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return all steps evaluated [P] and each run's values there [R, P].
-
-        Between its own evaluations a run is interpolated; before the first and after
-        the last it is NaN.
-        """
-        steps = np.unique([row["steps"] for run in self.runs for row in run])
-        curves = (_points(run, column) for run in self.runs)
-        values = [np.interp(steps, *c, left=np.nan, right=np.nan) for c in curves]
-        return steps, np.array(values)
-
-
-def compare(
-    curves: Sequence[Curve], out: Path, title: str, level: float | None = None
-) -> Path:
-    """Draw ways of learning side by side, and return the picture's file.
-
-    Each has a line for the mean of its runs and a band for their range, as far as all
-    of them reach, and a thin line for every run.
-
-    Args:
-        curves: At least one.
-        out: Picture to write.
-        title: What stands above, the task for instance.
-        level: Fingers a step to mark as the paper's; None: no such line.
-    """
-    figure = Figure(figsize=(8.0, 6.2), dpi=100, layout="constrained")
-    panels = _panels(figure, heights=(1, 1, 1))
-    for axes, (column, name, scale) in zip(panels, COMPARED, strict=True):
-        for curve, color in zip(curves, cycle(CURVE_COLORS)):
-            _draw_range(axes, curve, column, scale, color)
-        axes.set(ylabel=name, ylim=(-3, 103) if scale == 100 else (0, None))
-    fingers = panels[-1]
-    if level is not None:
-        fingers.axhline(level, color=INK, linewidth=1.2, linestyle="--")
-        fingers.annotate(
-            f"the paper: {level:g}",
-            (1, level),
-            xycoords=fingers.get_yaxis_transform(),
-            xytext=(0, 3),
-            textcoords="offset points",
-            ha="right",
-            color=INK,
-            fontsize=8.5,
-        )
-    fingers.set_xlim(left=0)
-    figure.suptitle(title, color=INK)
-    figure.legend(
-        *fingers.get_legend_handles_labels(),
-        loc="outside lower center",
-        ncols=len(curves),
-        frameon=False,
-        labelcolor=INK,
-    )
-    return _save(figure, out)
-
-
-def _draw_range(
-    axes: Axes, curve: Curve, column: str, scale: float, color: str
-) -> None:
-    steps, values = curve.over_steps(column)
-    values = scale * values
-    common = np.isfinite(values).all(axis=0)  # steps that every seed has reached
-    shared = values[:, common]
-    seeds = f"{len(curve.runs)} seed{'s' if len(curve.runs) > 1 else ''}"
-    label = f"{curve.label} ({seeds})"
-    mean, low, high = shared.mean(axis=0), shared.min(axis=0), shared.max(axis=0)
-    axes.plot(steps[common], mean, "o-", color=color, ms=3, label=label)
-    axes.fill_between(steps[common], low, high, color=color, alpha=0.18, linewidth=0)
-    if len(values) > 1:
-        axes.plot(steps, values.T, color=color, linewidth=0.7, alpha=0.6)
 
 
 def bars(report: AuditReport, out: Path) -> Path:

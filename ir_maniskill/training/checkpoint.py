@@ -227,7 +227,7 @@ def load_agent(path: Path | str) -> tuple[Agent, TrainConfig, dict[str, Any]]:
     try:
         config = from_data(stored.metadata["config"])
         spec = StateSpec.from_data(stored.metadata["spec"])
-        # Sizes that the file claims take no memory before they are known to be right.
+        # On "meta" a wrong size in the file takes no memory.
         with torch.device("meta"):
             agent = Agent(config.agent, spec, policy_only=not complete)
         weights = {
@@ -244,13 +244,13 @@ def load_agent(path: Path | str) -> tuple[Agent, TrainConfig, dict[str, Any]]:
 
 
 def task_facts(experiment: Experiment) -> dict[str, Any]:
-    """Return what a task consists of as plain data, but for its id and words."""
+    """Return a task as plain data, without its id and words."""
     aside = ("id", "senses", "vocabulary")
     return {k: _plain(v) for k, v in vars(experiment).items() if k not in aside}
 
 
 def _plain(value: Any) -> Any:
-    """Return dataclasses as dicts of what is not as usual, tuples as lists."""
+    """Return dataclasses as dicts of fields that differ from their defaults."""
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
     if not dataclasses.is_dataclass(value):

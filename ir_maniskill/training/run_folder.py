@@ -53,7 +53,7 @@ class RunFolder:
             )
 
     def _enter(self) -> None:
-        """Take the folder for this process alone, and see that it can be written to."""
+        """Lock the folder for this process, and check that it can be written to."""
         require_writable(self.path / ".probe")
         self._lock = os.open(self.path, os.O_RDONLY)
         try:
@@ -68,7 +68,7 @@ class RunFolder:
             log.warning("%s: cannot be locked; train there only once", self.path)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what other ranks get: the places, but no hold on the folder."""
+        """Return what other ranks get: the paths, but not the lock."""
         return {**vars(self), "_lock": None, "_events": None}
 
     def read_last(self) -> Stored | None:
@@ -82,7 +82,7 @@ class RunFolder:
         return stored
 
     def begin(self, config: TrainConfig, steps: int) -> int:
-        """Write the config, and drop records of steps that will be made again.
+        """Write the config, and drop records of steps that will be repeated.
 
         Returns:
             The steps of the last evaluation recorded; 0 if there is none.
@@ -111,7 +111,7 @@ class RunFolder:
         return int(rows[-1]["steps"]) if rows else 0
 
     def write(self, name: str, data: bytes) -> None:
-        """Put `data` in place of a file of the folder, or leave that as it is."""
+        """Replace a file of the folder; if that fails, the old one stays."""
         with replacing(self.path / name) as aside:
             aside.write_bytes(data)
 
@@ -140,7 +140,7 @@ class RunFolder:
                 self._events.add_scalar(name, value, steps)
 
     def close(self) -> None:
-        """Flush the TensorBoard events, and give up what was held."""
+        """Flush the TensorBoard events, and unlock the folder."""
         if self._events is not None:
             with contextlib.suppress(OSError):  # the tables have all that they have
                 self._events.close()
@@ -175,10 +175,10 @@ def stored_config(folder: Path) -> TrainConfig | None:
 
 
 def whole_rows(table: Path) -> list[dict[str, str]]:
-    """Return the rows of a CSV table but those that were cut short.
+    """Return the complete rows of a CSV table; a crash may have cut the last one.
 
-    Office programs may have saved it, with a byte order mark, or with semicolons and
-    decimal commas.
+    Office programs may have saved it: with a byte order mark, semicolons, decimal
+    commas.
     """
     with table.open(newline="", encoding="utf-8-sig", errors="replace") as file:
         lines = [line for line in file if line.endswith("\n")]

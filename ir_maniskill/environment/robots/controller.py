@@ -18,14 +18,14 @@ from torch import Tensor
 class TargetController(PDJointPosController):
     """Joint position targets, kept within the limits, absolute or changed by a delta.
 
-    Differs from its parent in three ways: a delta never winds the target up beyond a
-    joint's limit, all that an action needs is computed once, where it can be, and a
-    reset of the env leaves the targets of other envs, and those of a restored state.
+    Three differences from its parent: targets never leave the joints' limits, numbers
+    that don't change are computed once, and a reset keeps the targets of other envs and
+    those of a restored state.
     """
 
     config: PDJointPosControllerConfig
     _stale: Tensor | None = None
-    """While the env is being reset: whose targets `reset` is to set anew [N] bool."""
+    """During a reset of the env: whose targets `reset` must set anew [N] bool."""
 
     def _initialize_joints(self) -> None:
         super()._initialize_joints()
@@ -77,7 +77,7 @@ class TargetController(PDJointPosController):
         self._target_qpos = targets
 
     def begin_reset(self) -> None:
-        """Take note of the envs being reset, which ManiSkill forgets before `reset`."""
+        """Remember which envs are reset: ManiSkill forgets it before `reset`."""
         self._stale = self.scene._reset_mask.clone()
 
     def reset(self) -> None:
@@ -94,7 +94,7 @@ class TargetController(PDJointPosController):
         self.set_drive_targets(self._target_qpos)
 
     def get_state(self) -> dict[str, Tensor]:
-        """Return the targets, which are state in every mode."""
+        """Return the targets: they are state in every control mode."""
         return {"target_qpos": self._target_qpos.clone()}
 
     def set_state(self, state: dict[str, Tensor]) -> None:

@@ -1,7 +1,7 @@
-"""Loads what a URDF describes into a scene, in SAPIEN's way but for two things.
+"""Loads a URDF into a scene with SAPIEN's loader.
 
-Of all that moves in it, the joints that the robot names are driven, each on its own,
-and the others are held: so qpos is J joints, whatever the file has.
+Only the joints that the robot names can move, each on its own. All others are fixed, so
+qpos always has J entries.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ def read_builder(
     held: Mapping[str, float],
     config: dict | None = None,
 ) -> ArticulationBuilder:
-    """Return a builder of what a file describes, in which only `joints` move.
+    """Return a builder of the articulation in a file; only `joints` can move.
 
     Args:
         scene: Where it is to be built.
         path: The file.
-        joints: Those that are driven. One that mimics another is driven on its own.
-        held: Where the other joints stand still, 0 if left out [rad] or [m].
+        joints: Driven joints. One that mimics another is driven on its own.
+        held: Positions of the fixed joints, 0 if left out [rad] or [m].
         config: ManiSkill's `urdf_config`: materials of links.
 
     Raises:
@@ -56,7 +56,7 @@ def read_builder(
 
 
 def _motion(kind: str, position: float) -> sapien.Pose:
-    """Return what a joint, which moves along or about x, does from 0 to a position."""
+    """Return the motion of a joint from 0 to a position; its axis is x."""
     if kind == "prismatic":
         return sapien.Pose([position, 0, 0])
     return sapien.Pose(q=[math.cos(position / 2), math.sin(position / 2), 0, 0])

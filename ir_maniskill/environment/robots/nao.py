@@ -12,7 +12,7 @@ from typing import Any
 
 from mani_skill.agents.registration import register_agent
 
-from ir_maniskill.assets.nao import URDF_PATH
+from ir_maniskill.assets.nao import URDF_PATH, facts
 from ir_maniskill.environment.robots.nao_urdf import adapt
 from ir_maniskill.environment.robots.robot import JointGroup, Robot
 
@@ -56,8 +56,11 @@ HAND = JointGroup(stiffness=2.0, damping=0.1, armature=1e-3, delta=0.2)
 
 # -- Posture -------------------------------------------------------------------------
 
-HANDS_OVER_TABLE = {"LShoulderPitch": -0.13, "RShoulderPitch": -0.13}
-"""Hands hovering over the objects [rad]."""
+HANDS_OVER_TABLE = {
+    **{"LShoulderPitch": -0.13, "RShoulderPitch": -0.13},
+    **facts.read_posture(),
+}
+"""Hands hovering over the objects; head and legs, which are never driven [rad]."""
 
 REST = {
     "LShoulderPitch": 1.40,
@@ -79,9 +82,10 @@ POSTURES = {"hands_over_table": HANDS_OVER_TABLE, "rest": REST}
 ARM_BIT = {"L": 0, "R": 1}
 """An arm never collides with itself."""
 TORSO_BIT = {"L": 2, "R": 3}
-"""The torso never collides with the upper arms, which are always close to it; forearms
-and hands do collide with it and with the other arm."""
+"""The torso, with head and legs, never collides with the upper arms, which are always
+close to it; forearms and hands do collide with it and with the other arm."""
 UPPER_ARM = ("Shoulder", "Bicep", "Elbow")
+LOWER_ARM = ("ForeArm", "_wrist", "_gripper", "Finger", "Thumb")
 
 # -- Reach ---------------------------------------------------------------------------
 
@@ -135,10 +139,9 @@ class Nao(Robot):
 
     def collision_bits(self, link: str) -> tuple[int, ...]:
         """Return the bits of a link; links that share one never collide."""
-        if link == "torso":
-            return tuple(TORSO_BIT.values())
-        side = link[0].upper()
-        if side not in ARM_BIT:
-            return ()
-        upper = link[1:] in UPPER_ARM
-        return (ARM_BIT[side], TORSO_BIT[side]) if upper else (ARM_BIT[side],)
+        side, part = link[0].upper(), link[1:]
+        if part.startswith(UPPER_ARM):
+            return ARM_BIT[side], TORSO_BIT[side]
+        if part.startswith(LOWER_ARM):
+            return (ARM_BIT[side],)
+        return tuple(TORSO_BIT.values())
