@@ -257,7 +257,8 @@ class Session:
         found, rng = [], Random(self.seed)
         for kind in self.env.experiment.instructions.kinds:
             with suppress(GoalError):  # of some scenes there is little to say
-                found.append(say(draw(here, [kind], rng, allows=allows), rng))
+                goal = draw(here, [kind], rng, allows=allows)
+                found.append(min((say(goal, rng) for _ in range(20)), key=len))
         return [*found, "dance!"]
 
     # -- Objects -----------------------------------------------------------------------
