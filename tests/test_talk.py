@@ -385,6 +385,18 @@ def test_the_page_listens_here_alone_and_shares_nothing(page):
 
 
 @pytest.mark.render
+def test_bodies_are_drawn_on_their_way(page, session):
+    go_on(session, 2)
+    page.stage.show(session, lasts=1000.0)
+    page.stage._shown -= 250.0
+    page.stage.draw()
+    drawn = [page.stage._bodies[body.name].position for body in session.bodies]
+    quarter = between(session.before, session.now, 0.25)[:, :3]
+    assert not np.allclose(drawn, session.now[:, :3], atol=1e-3)
+    assert np.allclose(drawn, quarter, atol=1e-4)
+
+
+@pytest.mark.render
 def test_nothing_moves_while_nobody_watches(page, session):
     live.keep_going(page, until=time.perf_counter() + 0.3)
     assert session.score.steps == 0
