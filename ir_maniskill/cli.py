@@ -241,10 +241,10 @@ class Video(_Play):
 class Talk:
     """Open a page to talk to a robot: type a sentence, watch it do as told."""
 
-    env_id: TaskId = "NaoTouchCubeShuffled-v1"
+    env_id: TaskId = "NaoInstruct-v1"
     """Task whose scene it is; MODULE is imported first."""
     checkpoint: Path | None = None
-    """Policy or checkpoint file; None: the one that ships with the package."""
+    """Policy or checkpoint file; None: one that ships with the package, if it fits."""
     policy: bool = True
     """Whether a policy moves the robot; --no-policy: random motion."""
     robot: str = "nao"

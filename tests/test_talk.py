@@ -17,12 +17,14 @@ from scenes import scene
 
 from ir_maniskill import cli
 from ir_maniskill.goals import Both, Instruction, Push, Ref, Then, Touch
+from ir_maniskill.language import KINDS, kind_of, parse
 from ir_maniskill.language.tokens import VOCABULARY
 from ir_maniskill.talk import cards, film, live, meshes
 from ir_maniskill.talk.page import Page, side_by_side
 from ir_maniskill.talk.players import RANDOM, RandomMotion
 from ir_maniskill.talk.reading import LONGEST, clean, grounded, in_words, read
 from ir_maniskill.talk.session import Run, Score, Session
+from ir_maniskill.talk.stage import between
 
 RED = "Touch the red cube."
 KNOWN = [
@@ -166,7 +168,6 @@ def test_a_sentence_longer_than_the_policy_reads_is_cut(session):
     session.tell("Touch the green cube with your left hand.")
     assert session.reading.said == "Touch the green cube with"
     assert session.reading.goal == Touch(Ref("green", "cube"), "left")
-    assert session.note == "It cannot read more than: Touch the green cube with"
 
 
 @pytest.mark.render
@@ -228,6 +229,31 @@ def test_without_a_policy_it_wanders(session):
 
 
 @pytest.mark.render
+def test_where_no_policy_fits_chance_moves_the_robot(session):
+    session.choose(robot="panda")
+    assert session.choice.policy == RANDOM
+    session.tell("Touch the red cube with your right hand.")
+    session.step()
+    assert session.reading.goal is None and "right" in session.reading.meaning
+    session.choose(robot="nao")
+    assert session.choice.policy == "NaoTouchCubeShuffled-v1"
+
+
+@pytest.mark.render
+def test_a_policy_of_the_language_is_told_what_is_said(session):
+    session.choose(task="NaoInstruct-v1")
+    assert session.choice.policy == "NaoInstruct-v1"
+    *examples, _ = session.examples()
+    assert {kind_of(parse(text)) for text in examples} <= set(KINDS) - {"then"}
+    session.tell("Tap the crimson one")
+    assert session.reading.said == "Tap the crimson one"
+    assert session.reading.guesses == ("crimson as red",)
+    session.tell("la " * 60)
+    assert session.reading.said == "la " * 39 + "la"
+    session.step()
+
+
+@pytest.mark.render
 def test_a_run_of_an_experiment_says_each_sentence_once(session):
     session.experiment("NaoTouchCubeMulti-v1")
     said = [session.reading.said]
@@ -239,17 +265,6 @@ def test_a_run_of_an_experiment_says_each_sentence_once(session):
     assert session.choice.policy == "NaoTouchCubeMulti-v1"
     session.tell(RED)
     assert session.run is None
-
-
-@pytest.mark.render
-def test_between_two_steps_bodies_move_evenly(session):
-    session.tell(RED)
-    go_on(session, 2)
-    before, now = session.between(0.0), session.between(1.0)
-    assert np.allclose(now, session.poses()) and not np.allclose(before, now)
-    half = (before[:, :3] + now[:, :3]) / 2
-    assert np.allclose(session.between(0.5)[:, :3], half)
-    assert np.allclose(np.linalg.norm(session.between(0.3)[:, 3:], axis=1), 1)
 
 
 def test_random_motion_is_gentle_and_repeats_itself():
@@ -300,7 +315,7 @@ def test_a_coarser_mesh_has_no_flat_triangles():
 
 @pytest.mark.render
 def test_all_that_is_seen_is_sent_as_glb(session):
-    bodies = session.bodies()
+    bodies = session.bodies
     assert {"torso", "scene-0_room", "scene-0_red cube"} <= {b.name for b in bodies}
     assert all(meshes.glb(body)[:4] == b"glTF" for body in bodies)
 
@@ -309,13 +324,26 @@ def test_the_clock_says_when_the_machine_is_too_slow(monkeypatch):
     now = 100.0
     monkeypatch.setattr(live.time, "perf_counter", lambda: now)
     clock = live.Clock()
-    now += 0.025
-    assert clock.share(1.0) == pytest.approx(0.5) and clock.share(2.0) == 1.0
+    assert clock.due
+    now = 100.03  # a step of 30 ms leaves 20 ms until the next one
+    clock.tick(1.0)
+    assert not clock.due
+    now = 100.051
+    assert clock.due
     for _ in range(60):
         now += 0.1
         clock.tick(1.0)
+        assert clock.due
     assert clock.pace(1.0) == "10 of 20 steps a second: as fast as this machine can"
     assert clock.pace(0.5) == "10 of 10 steps a second"
+
+
+def test_between_two_steps_bodies_move_evenly():
+    before = np.array([[0.0, 0, 0, 1, 0, 0, 0]])
+    now = np.array([[2.0, 0, 0, -np.cos(0.4), 0, 0, -np.sin(0.4)]])
+    half = [[1, 0, 0, -np.cos(0.2), 0, 0, -np.sin(0.2)]]
+    assert np.allclose(between(before, now, 0.5), half)
+    assert np.allclose(between(before, now, 1.0), now)
 
 
 # -- The page --------------------------------------------------------------------------
@@ -354,6 +382,18 @@ def test_the_page_listens_here_alone_and_shares_nothing(page):
     with socket.create_connection(("127.0.0.1", page.server.get_port()), 2) as line:
         line.sendall(b"GET /../../../../etc/passwd HTTP/1.1\r\nHost: x\r\n\r\n")
         assert b"root:" not in line.recv(65536)
+
+
+@pytest.mark.render
+def test_bodies_are_drawn_on_their_way(page, session):
+    go_on(session, 2)
+    page.stage.show(session, lasts=1000.0)
+    page.stage._shown -= 250.0
+    page.stage.draw()
+    drawn = [page.stage._bodies[body.name].position for body in session.bodies]
+    quarter = between(session.before, session.now, 0.25)[:, :3]
+    assert not np.allclose(drawn, session.now[:, :3], atol=1e-3)
+    assert np.allclose(drawn, quarter, atol=1e-4)
 
 
 @pytest.mark.render
@@ -396,12 +436,6 @@ def test_without_viser_one_line_says_what_to_install(monkeypatch, capsys):
     assert cli.run(["talk"]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert "pip install 'ir-maniskill[talk]'" in line
-
-
-def test_without_a_policy_for_the_robot_the_error_says_so(capsys):
-    assert cli.run(["talk", "NaoTouchCubeSingle-v1", "--robot", "panda"]) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert "--no-policy" in line
 
 
 # -- A real browser --------------------------------------------------------------------

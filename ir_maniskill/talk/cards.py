@@ -26,6 +26,8 @@ def sentence_card(reading: Reading, score: Score) -> str:
     if reading.unknown:
         words = ", ".join(map(escape, reading.unknown))
         rows.append(_row("words it never learned", words))
+    if reading.guesses:
+        rows.append(_row("it reads", ", ".join(map(escape, reading.guesses))))
     rows.append(f'<div style="margin-top:0.5em">{_outcome(reading, score)}</div>')
     return _card(rows)
 

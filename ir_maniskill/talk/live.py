@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 import math
 import time
-from contextlib import closing, suppress
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
+from threading import Event, Thread
 
 from ir_maniskill.environment.touch_env import CONTROL_FREQ
 from ir_maniskill.talk.film import Film
@@ -19,6 +21,8 @@ FRAME = 1 / 30
 """How often bodies are drawn, between steps too [s]."""
 IDLE = 0.05
 """How long to wait where nothing goes on [s]."""
+MOMENT = 0.005
+"""How long to wait for the time of a step [s]."""
 SMOOTHING = 0.1
 """Share of the newest step in the mean time that steps take."""
 
@@ -28,24 +32,30 @@ class Clock:
 
     def __init__(self) -> None:
         """Start now."""
-        self._last = time.perf_counter()
-        self._mean = 1 / CONTROL_FREQ
+        self.restart()
 
-    def share(self, speed: float) -> float:
-        """Return how much of the time until the next step has gone by, 1 at most."""
-        gone = (time.perf_counter() - self._last) * CONTROL_FREQ * speed
-        return min(gone, 1.0)
+    def restart(self) -> None:
+        """Forget what was before; a step is due."""
+        self._due = time.perf_counter()
+        self.period = 1 / CONTROL_FREQ
+        """Mean time from a step to the next one [s]."""
+        self._last = self._due - self.period
+
+    @property
+    def due(self) -> bool:
+        """Whether it is time for the next step."""
+        return time.perf_counter() >= self._due
 
     def tick(self, speed: float) -> None:
         """Take note of a step; a late one is not made up for."""
-        now, due = time.perf_counter(), self._last + 1 / (CONTROL_FREQ * speed)
-        took = now - self._last
-        self._mean += SMOOTHING * (took - self._mean)
-        self._last = due if now - due < 0.5 / CONTROL_FREQ else now
+        now = time.perf_counter()
+        self.period += SMOOTHING * (now - self._last - self.period)
+        self._last = now
+        self._due = max(self._due + 1 / (CONTROL_FREQ * speed), now)
 
     def pace(self, speed: float) -> str:
         """Say how fast it goes."""
-        rate, wanted = 1 / self._mean, CONTROL_FREQ * speed
+        rate, wanted = 1 / self.period, CONTROL_FREQ * speed
         slow = ": as fast as this machine can" if rate < 0.85 * wanted else ""
         return f"{rate:.0f} of {wanted:.0f} steps a second{slow}"
 
@@ -73,23 +83,40 @@ def run(session: Session, host: str, port: int, record: Path | None = None) -> N
 
 
 def keep_going(page: Page, film: Film | None = None, until: float = math.inf) -> None:
-    """Step, draw and obey, until a time of `time.perf_counter` [s]."""
+    """Step and obey, until a time of `time.perf_counter` [s]."""
     clock = Clock()
-    while time.perf_counter() < until:
-        started = time.perf_counter()
-        if page.obey():
-            page.refresh()
-        if page.paused or not page.watched:
-            page.show_pace("paused" if page.paused else "nobody watches")
-            time.sleep(IDLE)
-            clock = Clock()
-            continue
-        if clock.share(page.speed) >= 1:
-            page.attempt(page.session.step)
-            if film is not None:
-                film.add(page.session)
-            clock.tick(page.speed)
-            page.show_step()
-            page.show_pace(clock.pace(page.speed))
-        page.move(clock.share(page.speed))
-        time.sleep(max(0.0, started + FRAME - time.perf_counter()))
+    with _drawing(page):
+        while time.perf_counter() < until:
+            if page.obey():
+                page.refresh()
+            if page.paused or not page.watched:
+                page.show_pace("paused" if page.paused else "nobody watches")
+                time.sleep(IDLE)
+                clock.restart()
+            elif clock.due:
+                page.attempt(page.session.step)
+                if film is not None:
+                    film.add(page.session)
+                clock.tick(page.speed)
+                page.show_step(clock.period)
+                page.show_pace(clock.pace(page.speed))
+            else:
+                time.sleep(MOMENT)
+
+
+@contextmanager
+def _drawing(page: Page) -> Iterator[None]:
+    """Draw the bodies on a thread of its own: motion is smooth if steps take long."""
+    over = Event()
+
+    def draw() -> None:
+        while not over.wait(FRAME):
+            page.stage.draw()
+
+    thread = Thread(target=draw)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()

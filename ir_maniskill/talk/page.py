@@ -16,6 +16,7 @@ from PIL import Image
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.talk import cards
+from ir_maniskill.talk.players import RANDOM
 from ir_maniskill.talk.session import PAPER, Session, robots
 from ir_maniskill.talk.stage import Stage
 
@@ -186,19 +187,20 @@ class Page:
         for kind, box in self._choices.items():
             if box.value != getattr(choice, kind):
                 box.value = getattr(choice, kind)
-        examples = session.examples()
+        if session.held is None:  # else they would change all the time
+            self._offer(session.examples())
+        self.show_step()
+
+    def _offer(self, examples: list[str]) -> None:
         for place, button in enumerate(self._examples):
             button.visible = place < len(examples)
             if button.visible:
                 button.label = examples[place]
-        self.show_step()
-        self.move(1.0)
 
-    def show_step(self) -> None:
-        """Draw what a step changes."""
+    def show_step(self, lasts: float = 0.0) -> None:
+        """Draw what a step changes; bodies move for as long as it lasts [s]."""
         session = self.session
-        self.stage.build(session)
-        self.stage.mark(session)
+        self.stage.show(session, lasts)
         self._put(self._sentence, cards.sentence_card(session.reading, session.score))
         self._put(self._lights, cards.lights_card(session.lights()))
         self._put(self._run, cards.run_card(session.run))
@@ -209,11 +211,9 @@ class Page:
 
     def show_pace(self, pace: str) -> None:
         """Say how fast it goes."""
-        self._put(self._note, cards.note_card(self.session.note, pace))
-
-    def move(self, share: float) -> None:
-        """Draw the bodies between the last step's start, at 0, and now, at 1."""
-        self.stage.move(self.session, self.session.between(share))
+        deaf = "Random motion: it does not listen."
+        note = self.session.note or deaf * (self.session.choice.policy == RANDOM)
+        self._put(self._note, cards.note_card(note, pace))
 
     def _put(self, card: Any, content: str) -> None:
         if card.content != content:

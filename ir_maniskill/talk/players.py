@@ -10,9 +10,12 @@ import torch
 from torch import Tensor
 
 from ir_maniskill import experiment as catalog
+from ir_maniskill.agent.language_system import LexiconTransformer, TokenTransformer
 from ir_maniskill.experiment import Experiment
+from ir_maniskill.language.lexicon import lexicon
 from ir_maniskill.language.tokens import split_words
 from ir_maniskill.policy import Policy, load_policy, shipped
+from ir_maniskill.talk.reading import Reading
 from ir_maniskill.training.checkpoint import MismatchError
 
 RANDOM = "random motion"
@@ -76,8 +79,17 @@ def load(name: str) -> Policy:
 
 def shortened(policy: Policy, said: str) -> str:
     """Return as many words of a sentence, from its start, as a policy can read."""
-    longest = policy.config.agent.language_length
-    if "instruction" in policy.agent.encoder.language.reads:
-        while len(split_words(said)) > longest:
+    encoder = policy.agent.encoder.language
+    if isinstance(encoder, TokenTransformer):
+        while len(split_words(said)) > encoder.length:
             said = said[:-1].rstrip()
     return said
+
+
+def guesses(policy: Policy, reading: Reading) -> tuple[str, ...]:
+    """Return what a policy with a lexicon takes words for that it never learned."""
+    if not isinstance(policy.agent.encoder.language, LexiconTransformer):
+        return ()
+    known = lexicon(policy.vocabulary)
+    nearest = ((word, next(iter(known.read(word)), "")) for word in reading.unknown)
+    return tuple(f"{word} as {taken}" for word, taken in nearest if taken)

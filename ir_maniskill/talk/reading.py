@@ -46,6 +46,8 @@ class Reading:
     """Places of the objects meant among the scene's."""
     unknown: tuple[str, ...]
     """Words of `said` that the policy never learned."""
+    guesses: tuple[str, ...] = ()
+    """What it takes some of them for, e.g. "crimson as red"."""
 
 
 def clean(text: str) -> str:

@@ -19,18 +19,25 @@ import torch
 from mani_skill.utils.structs import Actor
 
 from ir_maniskill import experiment as catalog
-from ir_maniskill.checks import require, require_choice
+from ir_maniskill.checks import require_choice
+from ir_maniskill.environment.layout import layout_of
 from ir_maniskill.environment.robots.nao import Nao
 from ir_maniskill.environment.robots.robot import available_robots, short_name
 from ir_maniskill.environment.senses import cameras
 from ir_maniskill.environment.table_scene import OBJECT_HEIGHT, TABLE_TOP
 from ir_maniskill.experiment import OBJECT_SIZE, TABLE, Spoken
-from ir_maniskill.goals import Goal, GoalError, Instruction
+from ir_maniskill.goals import GoalError, Instruction
 from ir_maniskill.language import draw, say, things
-from ir_maniskill.language.tokens import split_words
 from ir_maniskill.policy import Policy
 from ir_maniskill.snapshot import Snapshot
-from ir_maniskill.talk.players import RANDOM, RandomMotion, fitting, load, shortened
+from ir_maniskill.talk.players import (
+    RANDOM,
+    RandomMotion,
+    fitting,
+    guesses,
+    load,
+    shortened,
+)
 from ir_maniskill.talk.reading import Reading, clean, names, read
 
 PAPER = {
@@ -97,8 +104,8 @@ class Session:
     """A conversation with one robot.
 
     Example:
-        >>> session = Session("NaoTouchCubeShuffled-v1")
-        >>> session.tell("Touch the red cube.")
+        >>> session = Session("NaoInstruct-v1")
+        >>> session.tell("Touch the object nearest to you.")
         >>> for _ in range(60):
         ...     session.step()
         >>> session.score.success_once
@@ -119,13 +126,12 @@ class Session:
             task: Id of the task.
             robot: Who does it.
             checkpoint: A policy's file; None: what ships for the task.
-            policy: Whether a policy moves the robot, or chance.
+            policy: Whether a policy moves the robot, if one fits, or chance.
             seed: Seed of the first scene.
 
         Raises:
             CheckpointError: There is no such policy.
             MismatchError: It was trained for another robot or other words.
-            ValueError: No policy fits the task and the robot.
             ExperimentError: The robot cannot reach what the task lays out.
         """
         self.note = ""
@@ -139,13 +145,7 @@ class Session:
             fits = load(str(checkpoint)).require_match
             fits(catalog.get(task), robot, any_task=True)
         players = fitting(task, robot, checkpoint)
-        require(
-            not policy or players[0] != RANDOM,
-            "policy",
-            f"none that fits {task} on the robot {robot!r}",
-            "a checkpoint (--checkpoint FILE), or random motion (--no-policy)",
-        )
-        self.seed, self._random = seed - 1, not policy
+        self.seed = seed - 1
         self._enter(Choice(task, robot, players[0] if policy else RANDOM))
 
     def close(self) -> None:
@@ -166,14 +166,10 @@ class Session:
             require_choice("task", choice.task, catalog.available())
             require_choice("robot", choice.robot, robots())
             players = self.players(choice)
-            if "policy" in wanted:
-                require_choice("policy", choice.policy, players)
-                chance = choice.policy == RANDOM
-            else:
-                chance = self._random
-                choice = replace(choice, policy=RANDOM if chance else players[0])
+            if "policy" not in wanted:
+                choice = replace(choice, policy=players[0])
+            require_choice("policy", choice.policy, players)
             self._enter(choice)
-            self._random = chance
         except ValueError as error:
             self.note = str(error)
 
@@ -215,8 +211,9 @@ class Session:
         self.obs, _ = self.env.reset(seed=self.seed)
         self._policy.reset()
         entities = self.env.scene.sub_scenes[0].entities
-        self._bodies = [entity for entity in entities if _visible(entity)]
-        self.before = self.poses()
+        self.bodies = [entity for entity in entities if _visible(entity)]
+        """The B bodies that can be seen; `poses` of them `before` a step and `now`."""
+        self.before = self.now = self.poses()
 
     # -- Sentences ---------------------------------------------------------------------
 
@@ -234,23 +231,15 @@ class Session:
         policy = self._policy
         reading = read(heard, self._known(), self.scene, policy.vocabulary)
         if isinstance(policy, Policy):
-            said = shortened(policy, reading.said)
-            if said != reading.said:
-                self.note = f"It cannot read more than: {said}"
-            reading = replace(reading, said=said)
+            said, guessed = shortened(policy, reading.said), guesses(policy, reading)
+            reading = replace(reading, said=said, guesses=guessed)
         if reading.goal is not None:
-            try:
-                self._judge_by(reading.said, reading.goal)
+            try:  # the policy is told in `step`, at any length
+                self.env.tell(Instruction("", reading.goal))
             except ValueError as error:  # e.g. of a hand that this robot lacks
                 reading = replace(reading, goal=None, meaning=str(error), objects=())
         self.reading, self.score = reading, Score()
         self._touching = [False] * len(self.env.agent.fingers)
-
-    def _judge_by(self, said: str, goal: Goal) -> None:
-        """Have the env measure a goal; the policy reads what is said, however long."""
-        longest = self.env.experiment.max_tokens
-        fits = len(split_words(said)) <= longest
-        self.env.tell(Instruction(said if fits else "", goal))
 
     def _known(self) -> Sequence[Instruction]:
         """Return the task's own sentences; of the language there are none."""
@@ -258,24 +247,19 @@ class Session:
         return () if isinstance(known, Spoken) else known
 
     def examples(self) -> list[str]:
-        """Return sentences to try: the task's, or what can be said of this scene."""
+        """Return sentences to try: the task's, or some that can be done here."""
         if known := self._known():
             color = next(name for name in self.names if name).split()[0]
             more = (f"please tap the {color} one", "Touch the leftmost one.", "dance!")
             return [*[i.text for i in known[:5]], *more]
-        (here,) = things(self.scene)
-        spoken, rng = self.env.experiment.instructions, Random(self.seed)
-        found = []
-        for _ in range(6):
+        (here,) = things(replace(self.scene, start=self.scene.pose))
+        allows = layout_of(self.env.experiment, self.env.agent).allows(here)
+        found, rng = [], Random(self.seed)
+        for kind in self.env.experiment.instructions.kinds:
             with suppress(GoalError):  # of some scenes there is little to say
-                goal = draw(here, spoken.kinds, rng, allows=self._allows)
-                found.append(say(goal, rng))
-        return list(dict.fromkeys(found))
-
-    def _allows(self, acts: Sequence[tuple[str, int]]) -> bool:
-        """Return whether the robot has the hands that verbs ask for."""
-        hands = [verb.split()[0] for verb, _ in acts if verb.endswith(" hand")]
-        return set(hands) <= self.env.agent.hands.keys()
+                goal = draw(here, [kind], rng, allows=allows)
+                found.append(min((say(goal, rng) for _ in range(20)), key=len))
+        return [*found, "dance!"]
 
     # -- Objects -----------------------------------------------------------------------
 
@@ -309,6 +293,7 @@ class Session:
         if all(apart[i] >= APART for i in others):
             self.held = index, scale * place[0], scale * place[1]
             self._carry()
+            self.before = self.now = self.poses()
 
     def drop(self) -> None:
         """Let go of the object that is held; the sentence counts from here."""
@@ -332,11 +317,12 @@ class Session:
 
     def step(self) -> None:
         """Go on for one control step of 50 ms."""
-        self.before = self.poses()
+        self.before = self.now
         if self.held is not None:
             self._carry()
         action = self._policy.act(self.obs, self.reading.said)
         self.obs, reward, _, _, info = self.env.step(action)
+        self.now = self.poses()
         self._count(float(reward), info)
         self._go_on()
 
@@ -376,26 +362,9 @@ class Session:
 
     # -- What is to be seen ------------------------------------------------------------
 
-    def bodies(self) -> list[sapien.Entity]:
-        """Return the B bodies that can be seen."""
-        return list(self._bodies)
-
     def poses(self) -> np.ndarray:
         """Return where they are: positions [m] and quaternions (w, x, y, z) [B, 7]."""
-        return np.array([[*e.pose.p, *e.pose.q] for e in self._bodies])
-
-    def fingertips(self) -> np.ndarray:
-        """Return where the fingertips are [F, 3] [m]."""
-        return self.env.agent.finger_position()[0].numpy()
-
-    def between(self, share: float) -> np.ndarray:
-        """Return poses between the last step's start, at 0, and now, at 1 [B, 7]."""
-        now, before = self.poses(), self.before
-        same = np.sign((before[:, 3:] * now[:, 3:]).sum(axis=1, keepdims=True))
-        before = np.concatenate([before[:, :3], same * before[:, 3:]], axis=1)
-        poses = before + share * (now - before)
-        poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
-        return poses
+        return np.array([[*body.pose.p, *body.pose.q] for body in self.bodies])
 
     def pictures(self) -> dict[str, np.ndarray]:
         """Return what the policy's cameras see, by name [H, W, 3] uint8."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -28,7 +30,10 @@ STILL = 1e-5
 
 
 class Stage:
-    """What is drawn of a session: a node for each body that can be seen."""
+    """What is drawn of a session: a node for each body that can be seen.
+
+    All calls come from the simulator's thread, but for `draw`, which may have another.
+    """
 
     def __init__(
         self,
@@ -40,7 +45,10 @@ class Stage:
         self._server, self._drag, self._drop = server, drag, drop
         self._robot = ""
         self._bodies: dict[str, Any] = {}
-        self._sent: dict[str, np.ndarray] = {}
+        self._lock = Lock()
+        self._nodes: list[Any] = []
+        self._before = self._now = self._sent = np.empty((0, 7))
+        self._shown = self._lasts = 0.0
         self._lights: list[Any] = []
         self._rings: list[Any] = []
         self._things: dict[str, int] = {}
@@ -57,11 +65,39 @@ class Stage:
             "/sun", position=SUN, intensity=1.5, cast_shadow=True
         )
 
-    def build(self, session: Session) -> None:
-        """Bring what the session's scene has; most of it is there already."""
+    def show(self, session: Session, lasts: float) -> None:
+        """Bring what the session's scene has; `draw` moves it as its last step did.
+
+        Args:
+            session: What is shown.
+            lasts: How long the motion of that step takes [s].
+        """
+        with self._lock:
+            self._build(session)
+            nodes = [self._bodies[body.name] for body in session.bodies]
+            if nodes != self._nodes:
+                self._nodes, self._sent = nodes, np.full((len(nodes), 7), np.inf)
+            self._before, self._now = session.before, session.now
+            self._shown, self._lasts = time.perf_counter(), lasts
+        self._mark(session)
+
+    def draw(self) -> None:
+        """Draw the bodies where they are by now, on the way that `show` began."""
+        with self._lock:
+            gone = time.perf_counter() - self._shown
+            share = min(gone / self._lasts, 1.0) if self._lasts else 1.0
+            poses = between(self._before, self._now, share)
+            moved = np.abs(poses - self._sent).max(axis=1) >= STILL
+            self._sent[moved] = poses[moved]
+            for place in moved.nonzero()[0]:
+                node, pose = self._nodes[place], poses[place]
+                node.position, node.wxyz = pose[:3], pose[3:]
+
+    def _build(self, session: Session) -> None:
+        """Bring bodies and marks; most are there already."""
         if self._robot != session.choice.robot:
             self._change_robot(session)
-        bodies = {body.name: body for body in session.bodies()}
+        bodies = {body.name: body for body in session.bodies}
         things = {
             session.thing(place)._objs[0].name: place
             for place, name in enumerate(session.names)
@@ -72,10 +108,8 @@ class Stage:
         self._things = things
         for name in self._bodies.keys() - bodies.keys():
             self._bodies.pop(name).remove()
-            del self._sent[name]
         for name in bodies.keys() - self._bodies.keys():
             self._bodies[name] = self._add(bodies[name])
-            self._sent[name] = np.full(7, np.nan)
         self._add_marks(session)
 
     def _change_robot(self, session: Session) -> None:
@@ -83,7 +117,7 @@ class Stage:
         self._robot, scale = session.choice.robot, session.env.agent.scale
         for node in self._bodies.values():
             node.remove()
-        self._bodies, self._sent, self._things = {}, {}, {}
+        self._bodies, self._things = {}, {}
         cameras: list[Any] = [self._server.initial_camera]
         cameras += [client.camera for client in self._server.get_clients().values()]
         for camera in cameras:
@@ -133,17 +167,10 @@ class Stage:
             for n in range(len(session.names))
         ]
 
-    def move(self, session: Session, poses: np.ndarray) -> None:
-        """Draw the bodies where they are: their poses [B, 7]."""
-        for body, pose in zip(session.bodies(), poses, strict=True):
-            if not np.abs(pose - self._sent[body.name]).max() < STILL:
-                node, self._sent[body.name] = self._bodies[body.name], pose
-                node.position, node.wxyz = pose[:3], pose[3:]
-
-    def mark(self, session: Session) -> None:
+    def _mark(self, session: Session) -> None:
         """Light the fingertips that touch, and ring the objects that are meant."""
         states = [s for hand in session.lights().values() for s in hand.values()]
-        tips = session.fingertips()
+        tips = session.env.agent.finger_position()[0].numpy()  # [F, 3]
         for light, state, tip in zip(self._lights, states, tips, strict=True):
             if state:
                 light.position = tip
@@ -155,6 +182,15 @@ class Stage:
             _show(ring, meant := place in session.reading.objects)
             if meant:
                 ring.position = scale * np.array([*where[place, :2], TABLE_TOP])
+
+
+def between(before: np.ndarray, now: np.ndarray, share: float) -> np.ndarray:
+    """Return poses a share of the way from those before to those now [B, 7]."""
+    same = np.sign((before[:, 3:] * now[:, 3:]).sum(axis=1, keepdims=True))
+    start = np.concatenate([before[:, :3], same * before[:, 3:]], axis=1)
+    poses = start + share * (now - start)
+    poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
+    return poses
 
 
 def _show(node: Any, visible: bool) -> None:
