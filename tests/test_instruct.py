@@ -129,6 +129,7 @@ def snapshot(task: Experiment, slots: np.ndarray, places: np.ndarray) -> Snapsho
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("split", SPLITS)
 def test_in_ten_thousand_scenes_refs_fit_one_thing_and_sentences_parse_back(
     split: str,

@@ -62,7 +62,7 @@ LOW = TABLE_TOP + 0.03
 """Height of the fingertips when they push [m]."""
 PASSED = 0.004
 """How near to an object's middle the tip has missed it, or slid over it [m]."""
-SWEEP = 0.018
+SWEEP = 0.028
 """How far ahead of the tip its aim is while it pushes [m]."""
 ASTRAY = 0.014
 """How far beside its line the tip waits with pushing until it is back on it [m]."""
@@ -426,7 +426,7 @@ class Scripted:
         place, start = view.place(act.index), view.start(act.index)
         if (place - start) @ ahead >= goal.distance + 0.003:
             return None
-        end = start + ahead * (goal.distance + 0.02)
+        end = start + ahead * (goal.distance + 0.06)
         along = _unit((end - place) * (1, 1, 0))  # what strayed is brought back
         left = np.array([-along[1], along[0], 0])
         behind, top = place - BEHIND * along, view.top(act.index)
@@ -442,7 +442,7 @@ class Scripted:
         if act.phase == 1:
             return np.append(behind[:2], LOW), 0.002
         behind_it, beside = (tip - place) @ along, (tip - place) @ left
-        lead = SWEEP * max(0.0, 1 - abs(beside) / ASTRAY)
+        lead = SWEEP * max(0.5, 1 - abs(beside) / ASTRAY)
         onward = min(0.005, float(behind_it) + lead)
         aim = place + onward * along - 2 * beside * left
         return np.append(aim[:2], LOW), -0.05
