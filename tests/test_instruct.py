@@ -20,6 +20,7 @@ from ir_maniskill.language import (
     HELD_PAIRS,
     KINDS,
     SPLITS,
+    Thing,
     handwritten,
     kind_of,
     parse,
@@ -79,6 +80,17 @@ def test_what_is_drawn_depends_on_the_seed_alone() -> None:
     alone = drawn(instruct.ALL, "train", 1, seed=7)[0]
     among = drawn(instruct.ALL, "train", 9, seed=0)[7]
     assert (alone[0] == among[0]).all() and alone[2] == among[2]
+
+
+def test_a_push_is_asked_where_the_hand_behind_the_thing_has_room() -> None:
+    layout = layout_of(instruct.PUSH, Nao)
+    hand = 0.12 - 0.036  # where it begins to push left what lies at y = 0.12
+    for room, asked in ((0.061, True), (0.059, False)):
+        scene = (
+            Thing("red", "cube", 0.19, 0.12),
+            Thing("blue", "cube", 0.19, hand - room),
+        )
+        assert layout.allows(scene)([("push left", 0)]) == asked
 
 
 # -- Sentences -------------------------------------------------------------------------
@@ -142,10 +154,12 @@ def test_in_ten_thousand_scenes_refs_fit_one_thing_and_sentences_parse_back(
     scenes = snapshot(task, slots, places)
     strip = np.array([[task.objects.is_held_out(*at) for at in row] for row in places])
     rows: dict[Ref, list[int]] = {}
+    kinds = set()
     for row in range(len(slots)):
         said = speaker.say(speaker._things(slots[row], places[row]), rng)
         if said is not None:
             assert parse(said.text) == said.goal
+            kinds.add(kind_of(said.goal))
             for ref in refs_of(said.goal):
                 rows.setdefault(ref, []).append(row)
     new = set()
@@ -156,6 +170,7 @@ def test_in_ten_thousand_scenes_refs_fit_one_thing_and_sentences_parse_back(
         new |= {row for row, held_out in zip(found, named, strict=True) if held_out}
     told = set().union(*rows.values())
     assert len(told) > 1000 and new == (told if split == "places" else set())
+    assert kinds == set(KINDS)
 
 
 def test_training_has_thousands_of_sentences_of_forty_words() -> None:
@@ -246,12 +261,23 @@ def test_what_a_reset_is_told_is_true_of_its_scene(env: gym.Env) -> None:
         assert env.unwrapped.get_language_instruction() == [text]
 
 
+def test_a_sentence_that_fits_no_scene_is_refused(
+    env: gym.Env, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ir_maniskill.environment.speaker.SCENES", 20)
+    text = "Touch the red cube left of the red cube."
+    with pytest.raises(ValueError, match=f"got '{text}', expected what is true"):
+        env.reset(options={"instruction": text, "reconfigure": False})
+
+
 # -- Bad input -------------------------------------------------------------------------
 
 
 def test_a_split_that_there_is_not_is_refused() -> None:
     with pytest.raises(ExperimentError, match="split: got 'test', available: train"):
         instruct.ALL.in_split("test")
+    with pytest.raises(ExperimentError, match="split: got 'test', available: train"):
+        ir_maniskill.make_vec("NaoInstruct-v1", 2, split="test")
     with pytest.raises(ExperimentError, match="split of .*Single.*: got 'places'"):
         catalog.get("NaoTouchCubeSingle-v1").in_split("places")
 

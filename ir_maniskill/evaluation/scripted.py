@@ -61,11 +61,13 @@ BEHIND = 0.036
 LOW = TABLE_TOP + 0.03
 """Height of the fingertips when they push [m]."""
 PASSED = 0.004
-"""How near to an object's middle the tip has missed it, or slid over it [m]."""
+"""From which distance behind an object's middle the tip has slid over it [m]."""
 SWEEP = 0.028
 """How far ahead of the tip its aim is while it pushes [m]."""
 ASTRAY = 0.014
-"""How far beside its line the tip waits with pushing until it is back on it [m]."""
+"""Twice how far beside its line the tip pushes half as far ahead [m]."""
+BEYOND = 0.06
+"""How far beyond a push's end it heads, so that it turns gently [m]."""
 NEAR = 0.015
 """How near its way point is near enough [m]."""
 FAST, AHEAD = 0.35, 0.6
@@ -416,7 +418,8 @@ class Scripted:
         place, top = view.place(act.index), view.top(act.index)
         if act.phase == 0 and np.linalg.norm((tip - place)[:2]) > NEAR:
             return np.append(place[:2], top + OVER), 0.006
-        act.phase = 1
+        if act.phase == 0:
+            act.phase, act.x = 1, act.low
         return np.append(place[:2], top - 0.006), -0.05
 
     def _push(
@@ -426,12 +429,13 @@ class Scripted:
         place, start = view.place(act.index), view.start(act.index)
         if (place - start) @ ahead >= goal.distance + 0.003:
             return None
-        end = start + ahead * (goal.distance + 0.06)
+        end = start + ahead * (goal.distance + BEYOND)
         along = _unit((end - place) * (1, 1, 0))  # what strayed is brought back
         left = np.array([-along[1], along[0], 0])
+        onward, beside = float((tip - place) @ along), float((tip - place) @ left)
         behind, top = place - BEHIND * along, view.top(act.index)
-        lost = (tip - place) @ along > -PASSED or abs((tip - place) @ left) > 0.02
-        if act.phase == 2 and (lost or tip[2] > top + 0.005):
+        lost = onward > -PASSED or abs(beside) > 0.02 or tip[2] > top + 0.005
+        if act.phase == 2 and lost:
             act.phase = 0
         if act.phase == 0 and np.linalg.norm((tip - behind)[:2]) < NEAR:
             act.phase, act.x = 1, act.low
@@ -441,10 +445,8 @@ class Scripted:
             return np.append(behind[:2], top + OVER), 0.006
         if act.phase == 1:
             return np.append(behind[:2], LOW), 0.002
-        behind_it, beside = (tip - place) @ along, (tip - place) @ left
         lead = SWEEP * max(0.5, 1 - abs(beside) / ASTRAY)
-        onward = min(0.005, float(behind_it) + lead)
-        aim = place + onward * along - 2 * beside * left
+        aim = place + min(0.005, onward + lead) * along - 2 * beside * left
         return np.append(aim[:2], LOW), -0.05
 
     # -- Which hand does what ----------------------------------------------------------
