@@ -299,7 +299,7 @@ class Act:
     x: Array
     """Numbers of the hand at its way point [X]."""
     low: Array
-    """Those with which it would begin, down at or behind the object [X]."""
+    """Those with which it would be down at the object, or behind it to push it [X]."""
     miss: float
     """How far from reach it is [m]."""
     phase: int = 0
@@ -418,8 +418,7 @@ class Scripted:
         place, top = view.place(act.index), view.top(act.index)
         if act.phase == 0 and np.linalg.norm((tip - place)[:2]) > NEAR:
             return np.append(place[:2], top + OVER), 0.006
-        if act.phase == 0:
-            act.phase, act.x = 1, act.low
+        act.phase = 1
         return np.append(place[:2], top - 0.006), -0.05
 
     def _push(
