@@ -1,6 +1,7 @@
 """Free scenes and spoken sentences: what holds for all ids and splits."""
 
 from collections.abc import Iterator
+from random import Random
 
 import gymnasium as gym
 import numpy as np
@@ -17,14 +18,17 @@ from ir_maniskill.goals import COLORS, SHAPES, Instruction, Push, Ref, Touch
 from ir_maniskill.language import (
     HELD_OBJECTS,
     HELD_PAIRS,
+    KINDS,
     SPLITS,
+    Thing,
     handwritten,
     kind_of,
     parse,
     split_of,
 )
-from ir_maniskill.language.splits import acts_of
+from ir_maniskill.language.splits import acts_of, refs_of
 from ir_maniskill.language.tokens import split_words
+from ir_maniskill.snapshot import Snapshot
 from ir_maniskill.tasks import instruct
 
 TASKS = (
@@ -78,6 +82,17 @@ def test_what_is_drawn_depends_on_the_seed_alone() -> None:
     assert (alone[0] == among[0]).all() and alone[2] == among[2]
 
 
+def test_a_push_is_asked_where_the_hand_behind_the_thing_has_room() -> None:
+    layout = layout_of(instruct.PUSH, Nao)
+    hand = 0.12 - 0.036  # where it begins to push left what lies at y = 0.12
+    for room, asked in ((0.061, True), (0.059, False)):
+        scene = (
+            Thing("red", "cube", 0.19, 0.12),
+            Thing("blue", "cube", 0.19, hand - room),
+        )
+        assert layout.allows(scene)([("push left", 0)]) == asked
+
+
 # -- Sentences -------------------------------------------------------------------------
 
 
@@ -103,7 +118,59 @@ def test_sentences_are_of_their_split_and_true_of_their_scene(
             pairs = {(verb, scene[i].color) for verb, i in acts}
             assert bool(pairs & HELD_PAIRS) == (split == "pairs")
             held = [task.objects.is_held_out(scene[i].x, scene[i].y) for i in meant]
-            assert all(held) if split == "places" else not any(held)
+            # Two hands need things farther apart than the strip is wide.
+            some = any if kind_of(said.goal) == "both" else all
+            assert some(held) if split == "places" else not any(held)
+
+
+def snapshot(task: Experiment, slots: np.ndarray, places: np.ndarray) -> Snapshot:
+    """Return scenes of bodies in slots [N, C] at places [N, C, 2], nothing moving."""
+    kinds = [(list(COLORS).index(b.color), SHAPES.index(b.shape)) for b in task.bodies]
+    color, shape = torch.tensor([*kinds, (-1, -1)])[torch.tensor(slots)].unbind(-1)
+    pose = torch.zeros(*slots.shape, 7)
+    pose[..., :2] = torch.tensor(places)
+    return Snapshot(
+        contact=torch.zeros(len(slots), 0, slots.shape[1], dtype=torch.bool),
+        fingertip=torch.zeros(len(slots), 0, 3),
+        pose=pose,
+        start=pose,
+        velocity=torch.zeros_like(pose[..., :3]),
+        color=color,
+        shape=shape,
+        stage=torch.zeros(len(slots), dtype=torch.int64),
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("split", SPLITS)
+def test_in_ten_thousand_scenes_refs_fit_one_thing_and_sentences_parse_back(
+    split: str,
+) -> None:
+    task = Experiment("Mine-v1", Drawn(), Spoken(KINDS, split))
+    layout, rng = layout_of(task, Nao), Random(0)
+    speaker = Speaker(task, layout)
+    noise = np.random.default_rng(0).uniform(size=(10_000 // len(SPLITS), layout.noise))
+    slots, places = layout.lay_out(noise)
+    scenes = snapshot(task, slots, places)
+    strip = np.array([[task.objects.is_held_out(*at) for at in row] for row in places])
+    rows: dict[Ref, list[int]] = {}
+    kinds = set()
+    for row in range(len(slots)):
+        said = speaker.say(speaker._things(slots[row], places[row]), rng)
+        if said is not None:
+            assert parse(said.text) == said.goal
+            kinds.add(kind_of(said.goal))
+            for ref in refs_of(said.goal):
+                rows.setdefault(ref, []).append(row)
+    new = set()
+    for ref, found in rows.items():
+        fits = ref.resolve(scenes.rows(torch.tensor(found)))
+        assert (fits.sum(dim=1) == 1).all(), ref
+        named = strip[found][fits.numpy()]
+        new |= {row for row, held_out in zip(found, named, strict=True) if held_out}
+    told = set().union(*rows.values())
+    assert len(told) > 1000 and new == (told if split == "places" else set())
+    assert kinds == set(KINDS)
 
 
 def test_kinds_are_equally_frequent_though_some_fit_fewer_scenes() -> None:
@@ -199,12 +266,23 @@ def test_what_a_reset_is_told_is_true_of_its_scene(env: gym.Env) -> None:
         assert env.unwrapped.get_language_instruction() == [text]
 
 
+def test_a_sentence_that_fits_no_scene_is_refused(
+    env: gym.Env, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ir_maniskill.environment.speaker.SCENES", 20)
+    text = "Touch the red cube left of the red cube."
+    with pytest.raises(ValueError, match=f"got '{text}', expected what is true"):
+        env.reset(options={"instruction": text, "reconfigure": False})
+
+
 # -- Bad input -------------------------------------------------------------------------
 
 
 def test_a_split_that_there_is_not_is_refused() -> None:
     with pytest.raises(ExperimentError, match="split: got 'test', available: train"):
         instruct.ALL.in_split("test")
+    with pytest.raises(ExperimentError, match="split: got 'test', available: train"):
+        ir_maniskill.make_vec("NaoInstruct-v1", 2, split="test")
     with pytest.raises(ExperimentError, match="split of .*Single.*: got 'places'"):
         catalog.get("NaoTouchCubeSingle-v1").in_split("places")
 

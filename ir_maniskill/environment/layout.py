@@ -32,7 +32,7 @@ BEHIND, AT_END = 0.036, 0.034
 ends, beyond that [m]."""
 PUSHES = {"outward": (0.05, math.inf), "inward": (0.02, 0.19), "away": (0.02, math.inf)}
 """How far to the hand's own side the object may lie (least, most) [m]."""
-FREE_AHEAD, FREE_BEHIND, FREE_ARM = 0.06, 0.05, 0.05
+FREE_AHEAD, FREE_BEHIND, FREE_ARM = 0.06, 0.06, 0.05
 """Distance of others from where a pushed object goes, from the hand behind it, and from
 the arm between shoulder and hand, which is low then [m]."""
 BETWEEN_HANDS = 0.06
@@ -122,22 +122,28 @@ class Free:
     # -- What can be asked -----------------------------------------------------------
 
     def allows(self, things: Sequence[Thing]) -> Allows:
-        """Return whether the robot can do verbs to objects of a scene together."""
+        """Return whether the robot can do verbs to objects of a scene together.
+
+        In the split `places` one of the objects must lie in the part held out.
+        """
+        new = self.split == "places"
 
         def allowed(acts: Sequence[tuple[str, int]]) -> bool:
-            each = all(self._can(verb, index, things) for verb, index in acts)
-            return each and (len(acts) == 1 or self._can_both(acts, things))
+            held_out = any(self.drawn.is_held_out(*things[i][2:]) for _, i in acts)
+            (verb, index), *others = acts
+            if verb == "name":
+                return new or not held_out
+            if held_out != new:
+                return False
+            if others:
+                return self._can_both(acts, things)
+            return self._can(verb, index, things)
 
         return allowed
 
     def _can(self, verb: str, index: int, things: Sequence[Thing]) -> bool:
         *_, x, y = things[index]
-        held_out = self.drawn.is_held_out(x, y)
         first, _, last = verb.partition(" ")
-        if first == "name":
-            return self.split == "places" or not held_out
-        if held_out != (self.split == "places"):
-            return False
         if first == "push":
             return self._can_push(last, index, things)
         hands = [first] if last == "hand" else self.hands
@@ -193,8 +199,8 @@ class Free:
         verbs = tuple(verb for verb, _ in acts)
         if places[0, 1] - places[1, 1] < BETWEEN_HANDS:
             return False
-        if "touch" not in verbs:
-            return verbs == ("left hand", "right hand")
+        if verbs == ("right hand", "left hand"):
+            return False
         return all(map(self._touches, ("left", "right"), places))
 
 

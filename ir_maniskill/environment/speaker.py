@@ -83,9 +83,9 @@ class Speaker:
                 instruction = wanted if fits else None
             if instruction is not None:
                 return slot[0], xy[0], instruction
+        said = self.spoken if wanted is None else repr(wanted.text)
         raise GoalError(
-            f"instruction: got {wanted or self.spoken}, which is true of none of "
-            f"{SCENES} scenes"
+            f"instruction: got {said}, expected what is true of one of {SCENES} scenes"
         )
 
     def _things(self, slot: np.ndarray, xy: np.ndarray) -> list[Thing]:

@@ -45,11 +45,13 @@ def make_vec(
 
     Raises:
         UnknownExperimentError: There is no task of that id.
+        ExperimentError: The task has no such split.
         ValueError: A number is out of range, or there is no such backend here.
         WorkerError: Worker processes cannot be started, or one failed to make its envs.
         OSError: There is too little shared memory.
     """
     experiment = catalog.get(task_id)
+    experiment.in_split(env_kwargs.get("split", "train"))  # refused here, if it is none
     require_whole("num_envs", num_envs, 1)
     if num_workers is not None:
         require_whole("num_workers", num_workers, 1)

@@ -54,16 +54,22 @@ OVER = 0.03
 """How high above an object a hand passes [m]."""
 LIFT = 2
 """Steps of raising the hand straight up before it goes anywhere."""
+RAISED = np.array([0, 0, 0.05])
+"""Where it is raised to, and waits if it has nothing to do, above its start [m]."""
 BEHIND = 0.036
 """How far behind an object's center a push begins [m]."""
 LOW = TABLE_TOP + 0.03
 """Height of the fingertips when they push [m]."""
-SWEEP = 0.022
+PASSED = 0.004
+"""From which distance behind an object's middle the tip has slid over it [m]."""
+SWEEP = 0.028
 """How far ahead of the tip its aim is while it pushes [m]."""
+ASTRAY = 0.014
+"""Twice how far beside its line the tip pushes half as far ahead [m]."""
+BEYOND = 0.06
+"""How far beyond a push's end it heads, so that it turns gently [m]."""
 NEAR = 0.015
 """How near its way point is near enough [m]."""
-ASIDE = np.array([0.15, 0.20, 0.17])
-"""Where the left hand waits that has nothing to do [m]."""
 FAST, AHEAD = 0.35, 0.6
 """Largest change of the numbers in a step, and lead over where they are [rad]."""
 
@@ -292,6 +298,8 @@ class Act:
     """Which fingers touch."""
     x: Array
     """Numbers of the hand at its way point [X]."""
+    low: Array
+    """Those with which it would be down at the object, or behind it to push it [X]."""
     miss: float
     """How far from reach it is [m]."""
     phase: int = 0
@@ -308,8 +316,6 @@ class Episode:
     """Steps of this stage so far."""
     acts: dict[str, Act] = field(default_factory=dict)
     """What each hand does."""
-    idle: dict[str, Array] = field(default_factory=dict)
-    """Numbers of hands that have nothing to do [X]."""
     begun: dict[str, Array] = field(default_factory=dict)
     """Where the tips were when the stage began [3] [m]."""
 
@@ -360,11 +366,12 @@ class Scripted:
         for arm in self.arms.values():
             arm.rest = now
         if view.stage != episode.stage:
-            tips = {
-                h: a.hand(a.numbers(now), a.tips[0]).tip for h, a in self.arms.items()
-            }
             acts = self._assign(view, goal)
-            self._episodes[row] = episode = Episode(view.stage, 0, acts, {}, tips)
+            tips = {
+                hand: arm.hand(arm.numbers(now), _tips_of(arm, acts.get(hand))).tip
+                for hand, arm in self.arms.items()
+            }
+            self._episodes[row] = episode = Episode(view.stage, 0, acts, tips)
         episode.steps += 1
         for hand, arm in self.arms.items():
             x = self._next(hand, episode, view, now, wanted)
@@ -377,19 +384,17 @@ class Scripted:
         """Return the next numbers of a hand; None: it stays as it is."""
         arm, act = self.arms[hand], episode.acts.get(hand)
         now, target = arm.numbers(joints), arm.numbers(wanted)
-        lifts, start = episode.steps <= LIFT, episode.begun[hand]
+        tips, raised = _tips_of(arm, act), episode.begun[hand] + RAISED
         if act is None:
-            tips = arm.tips[0]
-            wait = np.add(start, (0, 0, 0.06)) if lifts else ASIDE * (1, arm.side, 1)
-            aim, x = view.aim(wait, []), episode.idle.get(hand, now)
-            x = episode.idle[hand] = arm.improve(x, tips, aim, 1)
+            aim = view.aim(raised, [])
+            x = arm.improve(target, tips, aim, 1)
         else:
-            tips, mine = act.tips, [a.index for a in episode.acts.values()]
+            mine = [a.index for a in episode.acts.values()]
             found = self._way_point(hand, act, view, now)
             if found is None:  # a push ends at once, a touch is held
                 return now if isinstance(act.goal, Push) else None
-            if lifts:
-                aim = view.aim(np.add(start, (0, 0, 0.05)), mine, 0.004)
+            if episode.steps <= LIFT:
+                aim = view.aim(raised, mine, 0.004)
                 x = arm.improve(now, tips, aim, 3)
             else:
                 aim = view.aim(found[0], mine, found[1], _way(act.goal))
@@ -423,24 +428,24 @@ class Scripted:
         place, start = view.place(act.index), view.start(act.index)
         if (place - start) @ ahead >= goal.distance + 0.003:
             return None
-        end = start + ahead * (goal.distance + 0.02)
+        end = start + ahead * (goal.distance + BEYOND)
         along = _unit((end - place) * (1, 1, 0))  # what strayed is brought back
         left = np.array([-along[1], along[0], 0])
+        onward, beside = float((tip - place) @ along), float((tip - place) @ left)
         behind, top = place - BEHIND * along, view.top(act.index)
-        lost = (tip - place) @ along > -0.012 or abs((tip - place) @ left) > 0.02
-        if act.phase == 2 and (lost or tip[2] > top + 0.005):
+        lost = onward > -PASSED or abs(beside) > 0.02 or tip[2] > top + 0.005
+        if act.phase == 2 and lost:
             act.phase = 0
         if act.phase == 0 and np.linalg.norm((tip - behind)[:2]) < NEAR:
-            act.phase = 1
+            act.phase, act.x = 1, act.low
         if act.phase == 1 and tip[2] < LOW + 0.012:
             act.phase = 2
         if act.phase == 0:
             return np.append(behind[:2], top + OVER), 0.006
         if act.phase == 1:
             return np.append(behind[:2], LOW), 0.002
-        behind_it, beside = (tip - place) @ along, (tip - place) @ left
-        onward = min(0.005, float(behind_it) + SWEEP)
-        aim = place + onward * along - beside * left
+        lead = SWEEP * max(0.5, 1 - abs(beside) / ASTRAY)
+        aim = place + min(0.005, onward + lead) * along - 2 * beside * left
         return np.append(aim[:2], LOW), -0.05
 
     # -- Which hand does what ----------------------------------------------------------
@@ -491,7 +496,7 @@ class Scripted:
         if isinstance(goal, Push):
             aim = self._at_end(view, goal, index)
             miss += arm.miss(arm.improve(x, tips, aim, 12), tips, aim)
-        return Act(goal, index, tips, high, miss)
+        return Act(goal, index, tips, high, x, miss)
 
     def _at_end(self, view: View, goal: Push, index: int) -> Aim:
         """Return the aim of a hand that has pushed something as far as it shall be."""
@@ -499,6 +504,10 @@ class Scripted:
         boxes[index, :2] = (view.start(index) + goal.distance * push)[:2]
         tip = np.append((boxes[index, :3] - 0.027 * push)[:2], LOW)
         return Aim(tip, boxes, view.aim(tip, [index]).margins, push)
+
+
+def _tips_of(arm: Arm, act: Act | None) -> Tips:
+    return arm.tips[0] if act is None else act.tips
 
 
 def _way(goal: Touch | Push) -> Array | None:

@@ -112,9 +112,13 @@ class _Scene:
         ]
 
     def acts(
-        self, verbs: Sequence[str], refs: Sequence[Found], split: str
+        self,
+        verbs: Sequence[str],
+        refs: Sequence[Found],
+        split: str,
+        alone: bool = True,
     ) -> list[Act]:
-        """Return what verbs can do to objects in a split."""
+        """Return what verbs can do to objects in a split; `alone` asks `allows`."""
         return [
             (verb, name, where, index)
             for name, where, index in refs
@@ -123,7 +127,7 @@ class _Scene:
             # In other splits, the sentence must name what is new.
             if status(verb, color, shape) == split == status(verb, *name)
             and can(verb, (color, shape))
-            and self.allows([(verb, index)])
+            and (not alone or self.allows([(verb, index)]))
         ]
 
     def related(self, relation: str) -> list[Found]:
@@ -244,7 +248,12 @@ def _two(
     """Return a goal with two objects; what the split holds out is in one of them."""
     for pair, new in _shuffled(product(verbs, (0, 1)), rng):
         a, b = (
-            view.acts(pair[i], view.plain, view.split if i == new else "train")
+            view.acts(
+                pair[i],
+                view.plain,
+                view.split if i == new else "train",
+                alone=kind is Then,
+            )
             for i in (0, 1)
         )
         both = [
