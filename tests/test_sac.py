@@ -129,9 +129,7 @@ def test_the_teacher_learns_first_and_then_stays_as_it_is(tmp_path) -> None:
         after = algorithm.state_dict()
         parts = ("agent.", "teacher.", "critics.")
         return [
-            any(
-                not torch.equal(before[k], after[k]) for k in after if k.startswith(p)
-            )
+            any(not torch.equal(before[k], after[k]) for k in after if k.startswith(p))
             for p in parts
         ]
 
