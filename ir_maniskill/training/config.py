@@ -93,7 +93,7 @@ class SACConfig:
     gradients: int = 2
     """Gradients of the critics for each step of all envs; the teacher has half of
     them."""
-    policy_from: float = 0.55
+    policy_from: float = 0.7
     """Share of the training in which the teacher learns; in the rest, the policy
     learns from it."""
     imitations: int = 2
@@ -246,7 +246,7 @@ CONFIGS: dict[str, TrainConfig] = {
     "default": TrainConfig(),
     "listen": TrainConfig(
         algorithm="sac",
-        total_steps=450_000,
+        total_steps=355_000,
         eval_interval=50_000,
         threads=1,
         frames=1,
