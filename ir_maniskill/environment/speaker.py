@@ -72,7 +72,7 @@ class Speaker:
             slot, xy = self.layout.lay_out(stream.uniform(size=(1, self.layout.noise)))
             there = self._things(slot[0], xy[0])
             if wanted is None:
-                # One that a hand alone cannot do, say, is not to be had.
+                # A kind may be impossible, such as two hands for a robot with one.
                 kinds = (kind,) if tried < PATIENCE else self.spoken.kinds
                 instruction = self.say(there, rng, kinds)
             else:

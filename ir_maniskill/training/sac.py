@@ -1,8 +1,8 @@
 """Soft actor-critic (Haarnoja et al., 2018), hindsight, and a policy that imitates.
 
-A teacher, which reads the simulator's state and the goal, learns from reward alone. A
-policy, which reads the sentence and perceives what it will later, learns meanwhile to
-do the same, also where it got to by itself (DAgger, Ross et al., 2011).
+First a teacher, which reads the simulator's state and the goal, learns from reward
+alone. Then a policy, which reads the sentence and perceives what it will later, learns
+to do the same, also where it got to by itself (DAgger, Ross et al., 2011).
 
 Legend: N envs, B steps of a batch, A numbers of an action, D numbers a critic reads.
 """
