@@ -17,8 +17,6 @@ SOURCES     := ir_maniskill ir_maniskill_cli.py tasks assets tests examples scri
 PYTEST      := $(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 
 export TORCH_INDEX
-# Threads that wait for work must not take the cores from the simulator.
-export OMP_WAIT_POLICY ?= passive
 .DELETE_ON_ERROR:
 .PHONY: help setup demo test test-fast check format docs doctor wheel clean
 

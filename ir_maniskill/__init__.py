@@ -12,14 +12,6 @@ Importing this package registers the robots and every task id, and does nothing 
     Goal           what a sentence asks for: `Touch`, `Push`, ... or a verb of your own
 """
 
-import os
-import sys
-
-# Threads of torch that wait for each other must not keep cores busy that simulators or
-# other programs need. Its OpenMP library reads this once, when torch is imported.
-if "torch" not in sys.modules:
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-
 import ir_maniskill.tasks  # noqa: F401 - registers the tasks
 from ir_maniskill.api import audit, evaluate, record
 from ir_maniskill.environment.vector import make_vec

@@ -10,7 +10,6 @@ bin=$(realpath "${1:?usage: gpu_check.sh VENV [FOLDER]}")/bin folder=${2:-runs/g
 [ -x "$bin/ir-maniskill" ] || { echo "$bin has no ir-maniskill: make setup first" && exit 2; }
 mkdir -p "$folder"
 : >"$folder/summary.txt"
-export OMP_WAIT_POLICY=passive
 root=$(realpath "$(dirname "$0")/..")
 failed=0
 

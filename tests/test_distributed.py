@@ -318,23 +318,6 @@ def test_the_ranks_of_a_machine_share_its_cores(monkeypatch):
     assert distributed.cores() == 1
 
 
-def test_without_a_passive_wait_an_update_has_one_thread(monkeypatch):
-    monkeypatch.setenv("OMP_WAIT_POLICY", "passive")
-    assert distributed.threads() == distributed.cores()
-    monkeypatch.delenv("OMP_WAIT_POLICY")
-    assert distributed.threads() == 1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("first", "policy"), [("", "passive"), ("torch,", "None")])
-def test_importing_the_package_first_lets_threads_wait_passively(first, policy):
-    environ = {k: v for k, v in os.environ.items() if k != "OMP_WAIT_POLICY"}
-    code = f"import os, {first} ir_maniskill; print(os.environ.get('OMP_WAIT_POLICY'))"
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, env=environ, capture_output=True, text=True)
-    assert done.stdout.strip() == policy, done.stderr
-
-
 # -- torchrun --------------------------------------------------------------------------
 
 

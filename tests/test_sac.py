@@ -73,7 +73,10 @@ def test_it_learns_to_touch_what_the_sentence_names(tmp_path) -> None:
 def test_steps_are_drawn_with_the_sentence_that_they_are_judged_under(tmp_path) -> None:
     algorithm = collected(tmp_path, ToyVectorEnv(snapshots=True))
     algorithm.config = dataclasses.replace(algorithm.config, batch=600)
-    drawn, seen = same(algorithm._draw), same(algorithm._draw_seen)
+    drawn, seen = (
+        same(algorithm._draw),
+        same(lambda: algorithm._seen(*algorithm._rows())),
+    )
     goal = torch.where(seen["instruction"][:, 1] == 4, -0.6, 0.6)  # token 4: "left"
     off = (drawn["next.now.proprioception"][:, 0] - goal).abs()
     near, far = off < 0.2, off > 0.5
@@ -140,7 +143,7 @@ def test_the_teacher_learns_first_and_then_stays_as_it_is(tmp_path) -> None:
 
 def test_the_policy_learns_to_do_what_the_teacher_does(tmp_path) -> None:
     algorithm = collected(tmp_path, ToyVectorEnv(snapshots=True))
-    seen = algorithm._draw_seen()
+    seen = algorithm._seen(*algorithm._rows())
 
     def off():
         with torch.no_grad():
@@ -150,20 +153,8 @@ def test_the_policy_learns_to_do_what_the_teacher_does(tmp_path) -> None:
 
     before, algorithm.share = off(), 0.5
     for _ in range(60):
-        algorithm._imitate(algorithm._draw_seen())
+        algorithm._imitate()
     assert off() < 0.3 * before
-
-
-def test_weights_of_convolutions_go_down_their_own_slope(tmp_path) -> None:
-    algorithm = collected(tmp_path, ToyVectorEnv(snapshots=True), episodes=0)
-    torch.manual_seed(0)
-    layer = torch.nn.Conv2d(3, 4, 3)
-    maps = torch.randn(2, 6, 6, 3).permute(0, 3, 1, 2)  # in memory, channels are last
-    before = layer.weight.detach().clone()
-    (slope,) = torch.autograd.grad(layer(maps).square().sum(), [layer.weight])
-    algorithm._optimizers["layer"] = adam(layer.parameters(), 0.01)
-    algorithm._step("layer", layer(maps).square().sum())
-    assert torch.equal((layer.weight.detach() - before).sign(), -slope.sign())
 
 
 def test_every_episode_is_kept_whole(tmp_path) -> None:

@@ -36,7 +36,9 @@ TABLE_THICKNESS = 0.02
 OBJECT_HEIGHT = {"cube": OBJECT_SIZE, "button": 0.024, "can": 0.042, "pyramid": 0.044}
 """Height of each shape [m]."""
 DENSITY = 0.05 / OBJECT_SIZE**3
-"""Of what is free: a cube has 50 g at NAO's scale [kg/m^3]."""
+"""Of what is free: cube and pyramid have 50 g at NAO's scale [kg/m^3]."""
+PYRAMID_FRICTION = (1.0, 1.0)
+"""Static and dynamic: a finger that comes from above does not slip off its sides."""
 TOP_COLOR = {"can": (0.45, 0.45, 0.47), "pyramid": (0.85, 0.85, 0.85)}
 """Linear RGB of the tops of shapes that are told by them, seen from above."""
 SHELF = (-3.0, 0.0, -1.0)
@@ -112,7 +114,10 @@ def build_object(
         builder.add_box_collision(half_size=[size / 2] * 3, density=DENSITY)
     elif thing.shape == "pyramid":
         hull = str(_MESHES / "pyramid_hull.glb")
-        builder.add_convex_collision_from_file(hull, scale=[scale] * 3, density=DENSITY)
+        rough = sapien.physx.PhysxMaterial(*PYRAMID_FRICTION, 0.0)
+        builder.add_convex_collision_from_file(
+            hull, scale=[scale] * 3, material=rough, density=2.25 * DENSITY
+        )
     else:
         upright = sapien.Pose(q=[math.sqrt(0.5), 0, -math.sqrt(0.5), 0])
         builder.add_cylinder_collision(upright, size / 2, height / 2, density=DENSITY)

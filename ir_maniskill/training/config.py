@@ -148,7 +148,7 @@ class TrainConfig:
     num_workers: int | None = None
     """Simulator processes of each rank on the CPU; None: one a core."""
     threads: int | None = None
-    """Threads of each rank's update; None: as `distributed.threads` says."""
+    """Pieces of a batch that each rank computes at once; None: one on each core."""
     control_mode: ControlMode = "pd_joint_target_delta_pos"
     """What an action means: "pd_joint_target_delta_pos" moves the joint targets,
     "pd_joint_pos" sets them (the paper's)."""
@@ -248,7 +248,6 @@ CONFIGS: dict[str, TrainConfig] = {
         algorithm="sac",
         total_steps=355_000,
         eval_interval=50_000,
-        threads=1,
         frames=1,
         penalty_warmup=0.0,
         reward_weights=RewardWeights(

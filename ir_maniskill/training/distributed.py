@@ -75,17 +75,6 @@ def cores() -> int:
     return max(1, len(os.sched_getaffinity(0)) // sharing)
 
 
-def threads() -> int:
-    """Return how many threads an update may use.
-
-    Threads of GNU's OpenMP keep their cores busy as they wait for each other, unless it
-    was told otherwise before torch loaded it (importing ir_maniskill first does that).
-    Where another program uses a core, one thread, which waits for nobody, is faster.
-    """
-    passive = os.environ.get("OMP_WAIT_POLICY", "").lower() == "passive"
-    return cores() if passive else 1
-
-
 def gather(values: Tensor) -> Tensor:
     """Return the rows [B, ...] of all ranks as one tensor [R*B, ...]."""
     if size() == 1:

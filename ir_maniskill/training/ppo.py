@@ -1,7 +1,7 @@
 """Proximal policy optimization (Schulman et al., 2017)."""
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 import torch
 from torch import Tensor, nn
@@ -20,6 +20,7 @@ from ir_maniskill.training.algorithm import (
 )
 from ir_maniskill.training.config import PPOConfig, TrainConfig
 from ir_maniskill.training.finite import check_finite
+from ir_maniskill.training.gradient import Loss, backward
 from ir_maniskill.training.rollout import Batch, RewardScale, Rollout
 from ir_maniskill.training.schedules import Curriculum, linear
 
@@ -44,6 +45,7 @@ class PPO(Algorithm):
     def __init__(self, config: TrainConfig, state: State, actions: int) -> None:
         """Make an untrained agent, the same on all ranks."""
         self.config = config.ppo
+        self._threads = config.threads or distributed.cores()
         spec = StateSpec.of(state, actions)
         self.agent = Agent(config.agent, spec).to(state["instruction"].device)
         distributed.copy_from_first(self.agent)
@@ -97,7 +99,8 @@ class PPO(Algorithm):
         with torch.no_grad():
             last_value = self.agent.value(self._next)
         rollout.finish(last_value, config.gamma, config.gae_lambda)
-        figures = improve(self.agent, self.optimizer, rollout, config)
+        threads = self._threads
+        figures = improve(self.agent, self.optimizer, rollout, config, threads)
         if "privileged" in rollout.state:
             seen = distributed.gather(rollout.state["privileged"].flatten(0, 1))
             self.agent.observe(seen)
@@ -140,17 +143,20 @@ def values_of(agent: Agent, state: State, chosen: Tensor) -> Tensor:
 
 
 def improve(
-    agent: Agent, optimizer: torch.optim.Optimizer, rollout: Rollout, config: PPOConfig
+    agent: Agent,
+    optimizer: torch.optim.Optimizer,
+    rollout: Rollout,
+    config: PPOConfig,
+    threads: int = 1,
 ) -> dict[str, float]:
     """Improve the agent on the roll-outs; return the figures of the last epoch."""
     figures: dict[str, float] = {}
     for epoch in range(config.epochs):
         history = defaultdict(list)
         for index in minibatches(rollout, config):
-            loss, terms = ppo_loss(agent, rollout.batch(index), config)
+            loss = minibatch_loss(agent, rollout, index, config)
+            terms = backward(loss, len(index), list(agent.parameters()), threads)
             check_finite(terms, "loss", "the learning rate is too high")
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()
             distributed.average_gradients(agent)
             terms["gradient"] = clip_gradient(agent, config.max_grad_norm)
             optimizer.step()
@@ -199,20 +205,32 @@ def minibatches(rollout: Rollout, config: PPOConfig) -> Iterator[Tensor]:
     yield from torch.randperm(total).to(rollout.reward.device).tensor_split(parts)
 
 
-def ppo_loss(
-    agent: Agent, batch: Batch, config: PPOConfig
-) -> tuple[Tensor, dict[str, Tensor]]:
+def minibatch_loss(
+    agent: Agent, rollout: Rollout, index: Tensor, config: PPOConfig
+) -> Callable[[slice], Loss]:
+    """Return the loss of a part of the minibatch with these flat indices [B]."""
+    advantage = normalize(rollout.advantage.flatten()[index])
+
+    def loss(part: slice) -> Loss:
+        batch = rollout.batch(index[part])._replace(advantage=advantage[part])
+        return ppo_loss(agent, batch, config)
+
+    return loss
+
+
+def ppo_loss(agent: Agent, batch: Batch, config: PPOConfig) -> Loss:
     """Return the loss of a minibatch, and its terms for the log.
 
-    The policy's part is -E[min(r A, clip(r, 1 - c, 1 + c) A)], r = pi / pi_old.
+    The policy's part is -E[min(r A, clip(r, 1 - c, 1 + c) A)], r = pi / pi_old; the
+    advantages A are normalized already.
     """
     now = agent.evaluate_actions(batch.state, batch.action)
-    advantage = normalize(batch.advantage)
     log_ratio = now.log_prob - batch.log_prob
     ratio = log_ratio.exp()
     clipped = ratio.clamp(1 - config.clip, 1 + config.clip)
+    gain = torch.minimum(ratio * batch.advantage, clipped * batch.advantage)
     terms = {
-        "policy": -torch.minimum(ratio * advantage, clipped * advantage).mean(),
+        "policy": -gain.mean(),
         "value": 0.5 * functional.mse_loss(now.value, batch.returns),
     }
     loss = terms["policy"] + VALUE_WEIGHT * terms["value"]
@@ -224,7 +242,7 @@ def ppo_loss(
         loss = loss + agent.config.auxiliary_weight * terms["auxiliary"]
     terms["kl"] = (ratio - 1 - log_ratio).mean()  # low-variance estimate, never < 0
     terms["clipped"] = ((ratio - 1).abs() > config.clip).float().mean()
-    return loss, {name: term.detach() for name, term in terms.items()}
+    return loss, terms
 
 
 def normalize(advantage: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ from ir_maniskill.agent.agent import Agent
 from ir_maniskill.environment.process_vector import ProcessVectorEnv, Step
 from ir_maniskill.environment.senses import State, StateStack
 from ir_maniskill.environment.vector import VectorEnv, info_of_step
-from ir_maniskill.evaluation.evaluate import EvaluationReport, evaluate_policy, threads
+from ir_maniskill.evaluation.evaluate import EvaluationReport, evaluate_policy
 from ir_maniskill.language import KINDS
 from ir_maniskill.training import checkpoint, distributed
 from ir_maniskill.training.algorithm import Algorithm, Outcome
@@ -74,7 +74,8 @@ class Runner:
         self.seconds = {"collect": 0.0, "update": 0.0}
         self.best_score = -math.inf
         torch.manual_seed(config.seed)
-        torch.set_num_threads(1)  # orthogonal weights depend on it in their last bits
+        # The cores belong to the simulator's workers and to the pieces of a batch.
+        torch.set_num_threads(1)
         self.state = self._new_scenes()
         actions = math.prod(envs.single_action_space.shape or ())
         self.algorithm = algorithm(config, self.state, actions)
@@ -131,23 +132,22 @@ class Runner:
         """
         check_finite(self.state, "observation", "the simulation became unstable")
         self.algorithm.share = min(self.steps / self.config.total_steps, 1.0)
-        with threads(1):  # the cores belong to the simulator's workers
-            action = self.algorithm.act(self.state)
-            figures, stepped = self._stepped(action.to(self.envs.device))
-            obs, reward, terminated, truncated, info = stepped
-            done, final = terminated | truncated, None
-            if "final_info" in info:
-                final = self._here(self.stack.peek(info["final_obs"]))
-            info = info_of_step(info, done)
-            self.state = self._here(self.stack.push(obs, done))
-            self.counts.add(reward, done, info)
-            ends = {"terminated": terminated, "truncated": truncated}
-            paid = {"reward": reward}
-            if "reward_terms" in info:
-                paid["terms"] = info["reward_terms"]
-            check_finite(paid, "outcome", "the simulation became unstable")
-            here = self._here(paid | ends)
-            self.algorithm.observe(Outcome(**here, state=self.state, final=final))
+        action = self.algorithm.act(self.state)
+        figures, stepped = self._stepped(action.to(self.envs.device))
+        obs, reward, terminated, truncated, info = stepped
+        done, final = terminated | truncated, None
+        if "final_info" in info:
+            final = self._here(self.stack.peek(info["final_obs"]))
+        info = info_of_step(info, done)
+        self.state = self._here(self.stack.push(obs, done))
+        self.counts.add(reward, done, info)
+        ends = {"terminated": terminated, "truncated": truncated}
+        paid = {"reward": reward}
+        if "reward_terms" in info:
+            paid["terms"] = info["reward_terms"]
+        check_finite(paid, "outcome", "the simulation became unstable")
+        here = self._here(paid | ends)
+        self.algorithm.observe(Outcome(**here, state=self.state, final=final))
         self.steps += self.config.num_envs
         return self._learned() if figures is None else figures
 
@@ -166,8 +166,7 @@ class Runner:
 
     def _learned(self) -> Figures:
         started = time.perf_counter()
-        with threads(self.config.threads or distributed.threads()):
-            figures = self.algorithm.update()
+        figures = self.algorithm.update()
         self.seconds["update"] += time.perf_counter() - started
         return figures
 

@@ -38,6 +38,7 @@ from ir_maniskill.training.algorithm import (
 )
 from ir_maniskill.training.config import SACConfig, TrainConfig
 from ir_maniskill.training.finite import check_finite
+from ir_maniskill.training.gradient import Loss, backward
 from ir_maniskill.training.hindsight import Hindsight, Pursuit, simulated
 from ir_maniskill.training.replay import Replay
 from ir_maniskill.training.schedules import linear
@@ -130,6 +131,7 @@ class SAC(Algorithm):
         require(ranks == 1, "processes", ranks, "1: SAC trains in a single one")
         self.hindsight = hindsight or Hindsight.of(config, config.sac.others)
         self.frames = config.frames
+        self.threads = config.threads or distributed.cores()
         self.agent = Agent(config.agent, StateSpec.of(state, actions))
         self.agent.to(state["instruction"].device)
         read = self.agent.encoder.language.reads
@@ -257,7 +259,7 @@ class SAC(Algorithm):
         self.updates += 1
         if self._schooling > 0:
             for _ in range(self.config.imitations):
-                self._imitate(self._draw_seen())
+                self._imitate()
         else:
             self._teach()
         if self.updates % LOGGED:
@@ -285,10 +287,9 @@ class SAC(Algorithm):
         drawn["terminal"] = replay.read("terminal", after)
         return drawn
 
-    def _draw_seen(self) -> State:
-        """Return a batch of states as the policy perceives them, and the truth."""
+    def _seen(self, rows: Tensor, which: Tensor) -> State:
+        """Return states as the policy perceives them, and the truth."""
         replay = self.replay
-        rows, which = self._rows()
         sensed = self.agent.encoder.sensed
         seen = {name: replay.read(name, rows, frames=self.frames) for name in sensed}
         seen |= {k: replay.read(k, rows, column=which) for k in self._sentence}
@@ -345,7 +346,7 @@ class SAC(Algorithm):
         value = self.critics(self._known(now), now["action"])
         loss = functional.mse_loss(value, target.expand_as(value), reduction="sum")
         loss = loss / len(target)
-        self._step("critics", loss)
+        self._descend("critics", loss)
         with torch.no_grad():
             rate = self.config.polyak
             slow, fast = self.slow.parameters(), self.critics.parameters()
@@ -357,14 +358,27 @@ class SAC(Algorithm):
         temperature, known = self.log_temperature.detach().exp(), self._known(now)
         action, log_prob = self._taught(known).rsample()
         value = self.critics(known, action).amin(dim=0)
-        self._step("teacher", (temperature * log_prob - value).mean())
+        self._descend("teacher", (temperature * log_prob - value).mean())
         entropy = linear(*ENTROPY, max(0.0, 1.5 * self._learned - 0.5))
         excess = -entropy * self.actions - log_prob.detach().mean()
-        self._step("temperature", self.log_temperature.exp() * excess)
+        self._descend("temperature", self.log_temperature.exp() * excess)
         self._note(entropy=-log_prob.mean(), temperature=temperature)
 
-    def _imitate(self, now: State) -> None:
+    def _imitate(self) -> None:
         """Do what the teacher does, and tell where the named object is."""
+        rows, which = self._rows()
+        self._set_rate("agent", self.config.policy_rate, self._schooling)
+        means = backward(
+            lambda part: self._imitation(self._seen(rows[part], which[part])),
+            len(rows),
+            self._weights("agent"),
+            self.threads,
+        )
+        self._step("agent")
+        self._note(**means)
+
+    def _imitation(self, now: State) -> Loss:
+        """Return how far the policy is off the teacher and the truth."""
         with torch.no_grad():
             shown = self._taught(self._known(now)).mean
         encoder, scene = self.agent.encoder, self._scene(now["snapshot"])
@@ -372,18 +386,17 @@ class SAC(Algorithm):
             aligned = encoder(now)
             mean = self.agent.actor(aligned).mean
         loss = functional.mse_loss(mean, shown)
-        self._note(imitation=loss)
+        means = {"imitation": loss}
         if isinstance(encoder.vision, ObjectVision):
             misseen = encoder.vision.misseen(aligned[:, encoder.seen], scene)
             loss = loss + misseen
-            self._note(misseen=misseen)
+            means["misseen"] = misseen
         if self.agent.locator is not None:
             guess, truth = self.agent.locator(aligned.float()), now["named"]
             off = 2 * functional.huber_loss(guess / LENGTH, truth / LENGTH)
             loss = loss + self.agent.config.auxiliary_weight * off
-            self._note(auxiliary=off, off=(guess - truth).norm(dim=1).median())
-        self._set_rate("agent", self.config.policy_rate, self._schooling)
-        self._step("agent", loss)
+            means |= {"auxiliary": off, "off": (guess - truth).norm(dim=1).median()}
+        return loss, means
 
     @property
     def _learned(self) -> float:
@@ -401,16 +414,23 @@ class SAC(Algorithm):
         part = min(share / WARMUP + 0.02, 3 * (1 - share) + 0.02, 1.0)
         self._optimizers[name].param_groups[0]["lr"] = rate * part
 
-    def _step(self, name: str, loss: Tensor) -> None:
-        """Make one step of an optimizer; the others' weights get no gradient."""
-        optimizer = self._optimizers[name]
-        weights = [w for group in optimizer.param_groups for w in group["params"]]
-        gradients = torch.autograd.grad(loss, weights, allow_unused=True)
+    def _descend(self, name: str, loss: Tensor) -> None:
+        """Make one step against a loss; the others' weights get no gradient."""
+        weights = self._weights(name)
+        gradients = torch.autograd.grad(loss, weights)
         for weight, gradient in zip(weights, gradients, strict=True):
-            # Fused Adam reads a gradient as it lies in memory, channels last or not.
-            weight.grad = gradient if gradient is None else gradient.contiguous()
-        nn.utils.clip_grad_norm_(weights, LONGEST)
-        optimizer.step()
+            weight.grad = gradient.contiguous()
+        self._step(name)
+
+    def _weights(self, name: str) -> list[Tensor]:
+        """Return what an optimizer improves."""
+        groups = self._optimizers[name].param_groups
+        return [weight for group in groups for weight in group["params"]]
+
+    def _step(self, name: str) -> None:
+        """Make one step of an optimizer."""
+        nn.utils.clip_grad_norm_(self._weights(name), LONGEST)
+        self._optimizers[name].step()
 
     def _note(self, **figures: Tensor) -> None:
         for name, value in figures.items():
