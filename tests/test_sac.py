@@ -14,7 +14,7 @@ from ir_maniskill.environment.senses import StateStack
 from ir_maniskill.training import checkpoint
 from ir_maniskill.training.algorithm import Outcome
 from ir_maniskill.training.hindsight import Hindsight
-from ir_maniskill.training.sac import SAC, Critics, adam
+from ir_maniskill.training.sac import SAC, Critics
 from ir_maniskill.training.train import run
 
 
