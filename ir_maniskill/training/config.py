@@ -93,7 +93,7 @@ class SACConfig:
     gradients: int = 2
     """Gradients of the critics for each step of all envs; the teacher has half of
     them."""
-    policy_from: float = 0.7
+    policy_from: float = 0.56
     """Share of the training in which the teacher learns; in the rest, the policy
     learns from it."""
     imitations: int = 2
@@ -246,8 +246,8 @@ CONFIGS: dict[str, TrainConfig] = {
     "default": TrainConfig(),
     "listen": TrainConfig(
         algorithm="sac",
-        total_steps=355_000,
-        eval_interval=50_000,
+        total_steps=440_000,
+        eval_interval=110_000,
         frames=1,
         penalty_warmup=0.0,
         reward_weights=RewardWeights(

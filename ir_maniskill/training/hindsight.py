@@ -277,8 +277,9 @@ def describe(
         *(serves, measure.bars.any(dim=1), measure.may_move, measure.still),
         *(verdict.right, verdict.wrong, verdict.disturbed, measure.holds, fouled),
     )
-    middle, moved = (_middle(x, measure) for x in (scene.position, scene.moved))
-    lengths = (way, threat, middle, 2 * moved)
+    places = (scene.position, scene.moved, measure.aim)
+    middle, moved, aim = (_middle(place, measure) for place in places)
+    lengths = (way, threat, middle, 2 * moved, 2 * aim)
     numbers = (measure.level, measure.gap / LENGTH, measure.stage)
     columns = [
         *(flag.flatten(1) if flag.ndim > 1 else flag[:, None] for flag in flags),
