@@ -328,9 +328,7 @@ class Push(Goal):
         way = way.where(serves, torch.inf).flatten(1).amin(dim=1)
         gap = (asked.distance - along).clamp(min=0) + strayed + way
         gap = gap.masked_fill(holds, 0.0)
-        progress = Push.LEVEL * (along / asked.distance).clamp(0, 1)
-        serves = asked.ref[:, None].expand_as(scene.contact)
-        behind = -Push.BEHIND * asked.ref[..., None] * asked.direction[:, None]
+        progress = Push.LEVEL * ((along - strayed) / asked.distance).clamp(0, 1)
         return Measure(
             *(holds, gap, serves), level=progress, may_move=asked.ref, aim=behind
         )
