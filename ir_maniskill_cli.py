@@ -41,6 +41,8 @@ Train an agent. Ctrl-C is safe: --resume goes on from there.
                         listen    many sentences: a teacher, and a policy
                         paper     as published: sparse reward, much slower
   --resume            go on from the folder's last checkpoint, with its config
+  --init-from POLICY  begin with the weights of a policy: a task for which one
+                      ships, a file, or a run's folder
   --out FOLDER        where checkpoints and figures go (runs/ID)
   --total-steps N     environment steps, over all envs (the preset's)
   --num-envs N        scenes simulated side by side (the preset's)

@@ -37,7 +37,7 @@ from ir_maniskill.training.config import (
     require_same,
 )
 from ir_maniskill.training.run_folder import stored_config
-from ir_maniskill.training.train import for_experiment
+from ir_maniskill.training.train import beginning_with, for_experiment
 from ir_maniskill.training.train import run as train
 
 TaskId = Positional[Annotated[str, arg(metavar="[MODULE:]ID")]]
@@ -373,23 +373,30 @@ def _in_one_line(error: Exception) -> str:
 def parse(arguments: Sequence[str]) -> Any:
     """Return the command that the arguments ask for.
 
-    A preset gives the defaults of the other options of `train`, hence the look ahead;
-    a run that is resumed gives them itself, once it is known which one it is.
+    A preset gives the defaults of the other options of `train`, hence the look ahead.
+    A run that is resumed gives them itself, and a policy to begin with gives some, once
+    it is known which one it is.
     """
     ahead = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     ahead.add_argument("--preset", nargs="?")
     preset = ahead.parse_known_args(list(arguments))[0].preset
     if preset is not None and preset not in CONFIGS:
         raise UsageError(f"--preset: got {preset!r}, available: {', '.join(CONFIGS)}")
-    command = _parse(arguments, CONFIGS[preset or "default"])
-    if not isinstance(command, Train) or not command.resume:
+    defaults = CONFIGS[preset or "default"]
+    command = _parse(arguments, defaults)
+    if not isinstance(command, Train):
         return command
-    config = command.train_config()
-    stored = stored_config(Path(config.out))
+    policy = command.config.init_from
+    if not (command.resume or policy):
+        return command
+    config = command.train_config()  # its module may register what the policy has
+    stored = stored_config(Path(config.out)) if command.resume else None
+    if stored is None or preset is not None:
+        command = _parse(arguments, beginning_with(policy, defaults))
     if stored is None:
         return command
     if preset is not None:  # it is given as much as single numbers are
-        given = for_experiment(config, catalog.get(config.env_id))
+        given = for_experiment(command.train_config(), catalog.get(config.env_id))
         require_same(stored, leaves(given))
     return _parse(arguments, stored)
 

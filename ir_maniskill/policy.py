@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 import torch
@@ -26,10 +27,11 @@ from ir_maniskill.language.tokens import split_words, warn_of_unknown
 from ir_maniskill.training.checkpoint import (
     CheckpointError,
     MismatchError,
+    acting,
     load_agent,
     task_facts,
 )
-from ir_maniskill.training.config import TrainConfig
+from ir_maniskill.training.config import WITH_WEIGHTS, TrainConfig
 
 
 class Policy:
@@ -117,11 +119,11 @@ class Policy:
         """Raise MismatchError unless it was trained for this task and robot.
 
         `robot` is what `robot_uids` takes, None its own; `any_task` accepts another
-        task, if it has the same words or the policy reads any.
+        task. The words must be the same, but for a policy that reads any.
         """
         pairs: dict[str, tuple[Any, Any]] = {}
         reads_any = "instruction" not in encoder_of(self.config.agent).reads
-        if self.vocabulary != experiment.vocabulary and not (any_task and reads_any):
+        if self.vocabulary != experiment.vocabulary and not reads_any:
             pairs["vocabulary"] = self.vocabulary, experiment.vocabulary
         if robot is not None and short_name(robot) != short_name(self.config.robot):
             pairs["robot"] = self.config.robot, robot
@@ -136,6 +138,32 @@ class Policy:
                 f"policy trained for {self.env_id} does not fit {experiment.id}: "
                 + "; ".join(told)
             )
+
+    def give_weights(self, agent: Agent) -> int:
+        """Give another agent the weights that this one acts by; return how many.
+
+        Raises:
+            MismatchError: They have not the names, shapes or words of its own.
+        """
+        weights, words = acting(self.agent), agent.config.vocabulary
+        given = {name: tuple(weight.shape) for name, weight in weights.items()}
+        own = {name: tuple(weight.shape) for name, weight in acting(agent).items()}
+        told = [
+            f"{name}: got {given.get(name)}, expected {own.get(name)}"
+            for name in given | own
+            if given.get(name) != own.get(name)
+        ]
+        if not told and self.vocabulary != words:
+            told = [_difference("vocabulary", self.vocabulary, words)]
+        if told:
+            raise MismatchError(
+                f"weights of the policy for {self.env_id} do not fit this agent: "
+                f"{shorten('; '.join(told), 300)}; expected a config with the policy's "
+                f"{', '.join(WITH_WEIGHTS)} (`train ID --init-from` has them, if they "
+                "are not told), and a task with its words"
+            )
+        agent.load_state_dict(weights, strict=False)
+        return len(weights)
 
     def _see(self, obs: Observation) -> State:
         """Add an observation to the history, and return the state."""
@@ -158,7 +186,8 @@ def load_policy(
 
     Args:
         id_or_path: Id of a task, for the policy that ships with the package, or the
-            path of a policy or checkpoint file such as `runs/ID/best.safetensors`.
+            path of a policy or checkpoint file such as `runs/ID/best.safetensors`, or
+            the folder of a run, for its best policy.
         device: Where it computes; None: the GPU if there is one.
 
     Raises:
@@ -167,6 +196,8 @@ def load_policy(
     path = shipped(str(id_or_path))
     if not path.exists():
         path = Path(id_or_path)
+    if path.is_dir():
+        path = path / "best.safetensors"
     if not path.exists():
         ids = ", ".join(name for name in catalog.available() if shipped(name).exists())
         raise CheckpointError(

@@ -364,5 +364,10 @@ def test_another_task_or_robot_is_refused(task):
     with pytest.raises(MismatchError, match=r"vocabulary\[5\]"):
         policy_for(task).require_match(words, any_task=True)
     load_policy("NaoInstruct-v1").require_match(words, any_task=True)  # it reads text
+    reader = policy_for(task)
+    reader.config = dataclasses.replace(
+        reader.config, agent=AgentConfig(language="lexicon")
+    )
+    reader.require_match(dataclasses.replace(task, vocabulary=words.vocabulary))
     with pytest.raises(MismatchError, match="robot: .*'nao', expected 'panda'"):
         policy_for(task).require_match(task, "panda")

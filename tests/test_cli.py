@@ -8,13 +8,14 @@ import torch
 
 from ir_maniskill import api, cli, experiment
 from ir_maniskill.agent.agent import Agent, StateSpec
+from ir_maniskill.policy import load_policy
 from ir_maniskill.training.checkpoint import save_policy
 from ir_maniskill.training.config import (
     CONFIGS,
     TrainConfig,
     to_json,
 )
-from ir_maniskill.training.train import for_experiment
+from ir_maniskill.training.train import beginning_with, for_experiment
 
 IDS = [
     f"NaoTouch{shape}{kind}-v1"
@@ -180,6 +181,27 @@ def test_a_run_that_is_resumed_gives_the_numbers_itself(monkeypatch, tmp_path, c
     assert trained_with(monkeypatch, *again)[0] == stored
     line = fails(capsys, "train", *go_on, "--preset", "default", "--seed", "3")
     assert "ppo.gamma (run: 0.95, now: 0.9)" in line
+
+
+def test_a_policy_to_begin_with_gives_what_its_weights_need(monkeypatch, tmp_path):
+    policy, task = load_policy("NaoInstruct-v1").config, "NaoTouchCubeShuffled-v1"
+    out = ("--out", str(tmp_path))
+    begin = (task, *out, "--init-from", "NaoInstruct-v1")
+    config, _ = trained_with(monkeypatch, *begin)
+    assert config == beginning_with(
+        "NaoInstruct-v1",
+        dataclasses.replace(CONFIGS["default"], env_id=task, out=str(tmp_path)),
+    )
+    assert (config.agent, config.frames) == (policy.agent, 1)
+    told = (*begin, "--preset", "listen", "--frames", "2")
+    config, _ = trained_with(monkeypatch, *told)
+    assert (config.agent, config.frames) == (policy.agent, 2)
+    assert config.sac == CONFIGS["listen"].sac
+    stored = for_experiment(config, experiment.get(task))
+    assert stored.agent.vocabulary == policy.agent.vocabulary  # it reads any text
+    (tmp_path / "config.json").write_text(to_json(stored))
+    for again in (told, (task, *out)):
+        assert trained_with(monkeypatch, *again, "--resume")[0] == stored
 
 
 def test_errors_of_many_lines_are_told_in_one(monkeypatch, capsys):

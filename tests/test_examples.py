@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from ir_maniskill import available
+from ir_maniskill import available, load_policy
 from ir_maniskill.training.config import CONFIGS
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -19,10 +19,10 @@ import runpy, sys
 from dataclasses import replace
 import ir_maniskill.training.runner as loop
 import ir_maniskill.evaluation.video as video
-from ir_maniskill.training.config import CONFIGS, PPOConfig
+from ir_maniskill.training.config import CONFIGS, PPOConfig, SACConfig
 loop.FINAL_EPISODES, video.SHARPNESS = 2, 0.1
 small = dict(num_envs=2, num_workers=1, eval_episodes=2, ppo=PPOConfig(64, 1, None),
-             camera_height=32, camera_width=16)
+             sac=SACConfig(random_steps=64, batch=8), camera_height=32, camera_width=16)
 for name, config in CONFIGS.items():
     CONFIGS[name] = replace(config, **small)
 sys.argv = sys.argv[1:]
@@ -120,6 +120,26 @@ def test_training_then_evaluating_its_policy(tmp_path: Path) -> None:
     assert re.search(r"Touch the blue cube\. +1 ", out)
     for name in ("report.json", "video.mp4"):
         assert (tmp_path / "runs" / "evaluation" / name).stat().st_size > 1000
+
+
+@pytest.mark.render
+@pytest.mark.slow
+def test_a_task_is_learned_from_scratch_or_from_another_policy(tmp_path: Path) -> None:
+    command = ("-c", TINY, script("pretrained.py"), "--steps", "64")
+    run(tmp_path, *command)
+    out = run(tmp_path, *command, "--init-from", "NaoInstruct-v1")
+    assert re.search(r"Press the crimson bell\. +1 .*\nGrab the navy tin\. +1 ", out)
+    assert "best policy is in runs/pretrained/best.safetensors" in out
+    before, scratch, begun = (
+        load_policy(name).agent.actor.layers[0].weight
+        for name in (
+            "NaoInstruct-v1",
+            tmp_path / "runs/scratch",
+            tmp_path / "runs/pretrained",
+        )
+    )
+    assert (begun - before).norm() < 0.1 * before.norm()
+    assert (scratch - before).norm() > 0.5 * before.norm()
 
 
 # -- The notebook ----------------------------------------------------------------------

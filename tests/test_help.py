@@ -37,9 +37,10 @@ def test_the_help_of_train_is_short_and_true():
     options = re.findall(
         r"^  (--[\w.-]+)(?: [A-Z]+)* {2,}", ir_maniskill_cli.TRAIN, re.M
     )
-    assert len(options) == 11 and options.pop() == "--help-all"
+    assert len(options) == 12 and options.pop() == "--help-all"
     values = {"--preset": "paper", "--sim-backend": "physx_cuda"}
     values |= {"--robot": "g1", "--agent.senses": "proprioception"}
+    values |= {"--init-from": TASK}
     for option in options:
         value = [] if option == "--resume" else [values.get(option, "3")]
         cli.parse(["train", TASK, option, *value, "--out", "/nowhere"])

@@ -14,6 +14,7 @@ from ir_maniskill.environment.senses import StateStack
 from ir_maniskill.training import checkpoint
 from ir_maniskill.training.algorithm import Outcome
 from ir_maniskill.training.hindsight import Hindsight
+from ir_maniskill.training.runner import Runner
 from ir_maniskill.training.sac import SAC, Critics
 from ir_maniskill.training.train import run
 
@@ -68,6 +69,20 @@ def test_it_learns_to_touch_what_the_sentence_names(tmp_path) -> None:
     agent, _, metadata = checkpoint.load_agent(best)
     assert metadata["evaluation"]["overall"]["success"] == 1
     assert agent.locator is None, "a policy file has what only training needs"
+
+
+def test_its_policy_may_begin_with_anothers_weights(tmp_path, monkeypatch) -> None:
+    def keep(self):
+        file, agent, config = self.folder.best, self.algorithm.agent, self.config
+        checkpoint.save_policy(file, agent, config, steps=0, evaluation={})
+
+    monkeypatch.setattr(Runner, "learn", keep)
+    first = learn(tmp_path / "first", 1)
+    begun = learn(tmp_path / "begun", 1, seed=1, init_from=str(tmp_path / "first"))
+    fresh = learn(tmp_path / "fresh", 1, seed=1)
+    first, begun, fresh = (checkpoint.read(f).tensors for f in (first, begun, fresh))
+    assert all(torch.equal(first[name], begun[name]) for name in first)
+    assert not any(torch.equal(v, fresh[k]) for k, v in first.items() if v.ndim > 1)
 
 
 def test_steps_are_drawn_with_the_sentence_that_they_are_judged_under(tmp_path) -> None:

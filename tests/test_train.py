@@ -14,9 +14,11 @@ from toy_envs import LENGTH, SENTENCES, ToyVectorEnv, toy_config
 
 from ir_maniskill.environment.vector import info_of_step
 from ir_maniskill.evaluation.evaluate import EvaluationReport, Rate, Score
+from ir_maniskill.language.tokens import VOCABULARY
 from ir_maniskill.training import checkpoint, distributed, ppo, run_folder, runner
 from ir_maniskill.training import train as training
-from ir_maniskill.training.checkpoint import CheckpointError
+from ir_maniskill.training.algorithm import under
+from ir_maniskill.training.checkpoint import CheckpointError, MismatchError
 from ir_maniskill.training.config import (
     AgentConfig,
     ConfigError,
@@ -25,7 +27,7 @@ from ir_maniskill.training.config import (
 )
 from ir_maniskill.training.finite import TrainingDivergedError
 from ir_maniskill.training.run_folder import RunFolder
-from ir_maniskill.training.train import train
+from ir_maniskill.training.train import beginning_with, train
 
 UPDATE = 32 * LENGTH  # steps of an update of the toy task
 
@@ -307,6 +309,99 @@ def test_a_run_that_ends_while_another_waits_for_its_folder_is_not_overwritten(
     )
     run(toy_config(folder, total_steps=3 * UPDATE), resume=True)
     assert steps == [2 * UPDATE]
+
+
+# -- Beginning with another policy's weights -------------------------------------------
+
+
+@pytest.fixture
+def before(tmp_path):
+    """Return the folder of a run to begin with."""
+    run(toy_config(tmp_path / "before", total_steps=UPDATE))
+    return tmp_path / "before"
+
+
+def begun(folder):
+    """Return the weights in a run's last checkpoint, by which its agent acts or not."""
+    weights = under("agent", tensors(folder)).items()
+    acting = {k: v for k, v in weights if not k.startswith(checkpoint.TRAINING_ONLY)}
+    return acting, {k: v for k, v in weights if k not in acting}
+
+
+def test_a_new_run_begins_with_the_weights_that_act(
+    tmp_path, before, interrupt, caplog
+):
+    interrupt(1)
+    new = toy_config(tmp_path / "new", seed=1, init_from=str(before))
+    with caplog.at_level("INFO"), pytest.raises(KeyboardInterrupt):
+        run(new)
+    acting, learning = begun(tmp_path / "new")
+    stored = checkpoint.read(before / "best.safetensors").tensors
+    assert_same(acting, {k: v.float() for k, v in stored.items()})
+    critic = begun(before)[1]["critic.value.0.weight"]
+    assert not torch.equal(learning["critic.value.0.weight"], critic)
+    told = f"begin with {len(acting)} weights of {before} (Toy-v1, {UPDATE} steps); "
+    assert told + f"{len(learning)} are new" in caplog.messages
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"hidden": (16, 32)},
+            r"actor.mean.0.weight: got \(32, 928\), expected \(16, 928\);.*agent, alg",
+        ),
+        (
+            {"senses": ("proprioception", "touch")},
+            r"policy for Toy-v1 do not fit .*got \(128, 6\), expected \(128, 12\)",
+        ),
+        (
+            {"vision": "paper"},
+            r"encoder.body.embedding.1.bias: got \(128,\), expected None",
+        ),
+    ],
+)
+def test_weights_that_do_not_fit_are_refused(tmp_path, before, change, message):
+    config = toy_config(tmp_path / "new", init_from=str(before))
+    agent = dataclasses.replace(config.agent, **change)
+    with pytest.raises(MismatchError, match=message):
+        run(dataclasses.replace(config, agent=agent))
+    assert not (tmp_path / "new" / "config.json").exists()
+
+
+def test_words_in_other_places_are_refused(tmp_path, before):
+    envs, words = ToyVectorEnv(), VOCABULARY
+    envs.experiment.vocabulary = (*words[:5], words[6], words[5], *words[7:])
+    with pytest.raises(MismatchError, match=r"vocabulary\[5\]: got 'blue', .*'red'"):
+        run(toy_config(tmp_path / "new", init_from=str(before)), envs=envs)
+
+
+def test_a_resumed_run_does_not_begin_again(tmp_path, before, interrupt):
+    config = toy_config(tmp_path / "whole", init_from=str(before))
+    run(config)
+    halves = dataclasses.replace(config, out=str(tmp_path / "halves"))
+    interrupt(3)
+    with pytest.raises(KeyboardInterrupt):
+        run(halves)
+    shutil.rmtree(before)
+    run(halves, resume=True)
+    assert_same(tensors(tmp_path / "whole"), tensors(tmp_path / "halves"))
+
+
+def test_what_the_weights_need_comes_with_them_unless_it_is_told(before):
+    preset = toy_config("x", agent=AgentConfig(), frames=1, camera_width=8)
+    config = beginning_with(str(before), preset)
+    own = toy_config("x")
+    assert (config.frames, config.camera_width, config.init_from) == (
+        3,
+        32,
+        str(before),
+    )
+    assert config.agent == dataclasses.replace(own.agent, vocabulary=VOCABULARY)
+    assert beginning_with(None, preset) is preset
+
+
+# -- Refusals --------------------------------------------------------------------------
 
 
 def test_a_folder_with_a_run_is_not_overwritten(tmp_path):

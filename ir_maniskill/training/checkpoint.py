@@ -191,6 +191,12 @@ def describe(agent: Agent, config: TrainConfig, **facts: object) -> dict[str, An
     }
 
 
+def acting(agent: Agent) -> dict[str, Tensor]:
+    """Return an agent's weights by name, but for those that only learning needs."""
+    weights = agent.state_dict().items()
+    return {k: v for k, v in weights if not k.startswith(TRAINING_ONLY)}
+
+
 def save_policy(
     path: Path,
     agent: Agent,
@@ -206,8 +212,7 @@ def save_policy(
     learned = dict(agent.named_parameters())
     weights = {  # what is counted or measured keeps all its bits
         name: weight.half() if name in learned else weight
-        for name, weight in agent.state_dict().items()
-        if not name.startswith(TRAINING_ONLY)
+        for name, weight in acting(agent).items()
     }
     facts = describe(agent, config, steps=steps, evaluation=dict(evaluation))
     write(path, Stored(POLICY, weights, facts))

@@ -19,7 +19,7 @@ AlgorithmName = Literal["ppo", "sac"]
 SimBackend = Literal["physx_cpu", "physx_cuda"]
 RenderBackend = Literal["auto", "cpu"]
 
-SCHEMA = 3
+SCHEMA = 4
 """Version of the form in which configs are written."""
 
 MAY_CHANGE = {
@@ -28,6 +28,12 @@ MAY_CHANGE = {
     *("eval_interval", "eval_episodes", "checkpoint_interval"),
 }
 """Fields that a resumed run may have anew."""
+
+WITH_WEIGHTS = (
+    *("agent", "algorithm", "robot", "control_mode", "frames"),
+    *("camera_height", "camera_width", "shader_pack"),
+)
+"""Fields that decide what a policy's weights are, and what they mean."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +143,9 @@ class TrainConfig:
     """Seed of weights, exploration and scenes."""
     robot: str = "nao"
     """Robot that learns it, by the name that `robot_uids` takes."""
+    init_from: str | None = None
+    """Policy whose weights to begin with: a task whose policy ships, a policy or
+    checkpoint file, or a run's folder; None: weights are drawn."""
     total_steps: int = 250_000
     """Environment steps, over all envs; rounded up to whole updates."""
     num_envs: int = 16
@@ -346,6 +355,8 @@ def migrate(data: object) -> object:
     if schema < 3:
         sac = dataclasses.asdict(SACConfig())
         fields = {"algorithm": "ppo", "sac": sac, **fields}
+    if schema < 4:
+        fields = {"init_from": None, **fields}
     return fields
 
 

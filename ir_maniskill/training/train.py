@@ -5,19 +5,24 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import logging
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from ir_maniskill import experiment as catalog
+from ir_maniskill.agent.agent import Agent
+from ir_maniskill.agent.language_system import encoder_of
 from ir_maniskill.checks import ConfigError, require
 from ir_maniskill.environment.vector import VectorEnv, make_vec
 from ir_maniskill.experiment import Experiment
+from ir_maniskill.policy import load_policy
 from ir_maniskill.training import distributed
 from ir_maniskill.training.algorithm import Algorithm
 from ir_maniskill.training.config import (
     CONFIGS,
+    WITH_WEIGHTS,
     TrainConfig,
     from_data,
     leaves,
@@ -28,6 +33,8 @@ from ir_maniskill.training.ppo import PPO
 from ir_maniskill.training.run_folder import RunFolder, stored_config
 from ir_maniskill.training.runner import Runner
 from ir_maniskill.training.sac import SAC
+
+log = logging.getLogger(__name__)
 
 ALGORITHMS: dict[str, type[Algorithm]] = {"ppo": PPO, "sac": SAC}
 """What `TrainConfig.algorithm` names."""
@@ -57,12 +64,15 @@ def train(
         eval_envs: The same for evaluations, which only the first rank makes.
         algorithm: What learns; None: what the config names.
         preset: Which of `CONFIGS` to train a task with.
-        **changes: Fields that shall be other than in the preset, or in `task`.
+        **changes: Fields that shall be other than in the preset, or in `task`. With
+            `init_from`, the policy decides instead of the preset what its weights need.
 
     Raises:
-        CheckpointError: If the folder or its checkpoint cannot be used.
+        CheckpointError: If the folder or its checkpoint cannot be used, or there is no
+            policy to begin with.
         ConfigError: If the run was begun with another config, or the envs, their number
             or that of the episodes do not fit.
+        MismatchError: If the weights to begin with do not fit the agent.
         OSError: If the folder cannot be written to.
         RankError: If another rank failed.
         TrainingDivergedError: If a number stopped being finite.
@@ -71,15 +81,15 @@ def train(
     if isinstance(task, str):
         require(preset in CONFIGS, "preset", preset, f"one of {', '.join(CONFIGS)}")
         changes = {"env_id": task, "out": f"runs/{task}", **changes}
-        config = dataclasses.replace(CONFIGS[preset], **changes)
+        stored = stored_config(Path(changes["out"])) if resume else None
+        usual = stored or beginning_with(changes.get("init_from"), CONFIGS[preset])
+        config = dataclasses.replace(usual, **changes)
     else:
         config = dataclasses.replace(task, **changes)
-    stored = stored_config(Path(config.out)) if resume else None
-    if stored is not None and isinstance(task, str):
-        config = dataclasses.replace(stored, **changes)
-    elif stored is not None:
-        experiment = envs.experiment if envs else catalog.get(stored.env_id)
-        config = resumed(stored, for_experiment(config, experiment))
+        stored = stored_config(Path(config.out)) if resume else None
+        if stored is not None:
+            experiment = envs.experiment if envs else catalog.get(stored.env_id)
+            config = resumed(stored, for_experiment(config, experiment))
     return run(config, resume, envs, eval_envs, algorithm)
 
 
@@ -124,13 +134,37 @@ def run(
         runner = Runner(config, folder, envs, evaluated_in, chosen)
         if stored is not None:
             runner.restore(stored)
+        elif config.init_from is not None:
+            _give_weights(config.init_from, runner.algorithm.agent)
         runner.learn()
     return folder.best
 
 
+def beginning_with(policy: str | None, config: TrainConfig) -> TrainConfig:
+    """Return the config with what a policy's weights need, if there is a policy."""
+    if policy is None:
+        return config
+    trained = load_policy(policy, device="cpu").config
+    needed = {name: getattr(trained, name) for name in WITH_WEIGHTS}
+    return dataclasses.replace(config, init_from=policy, **needed)
+
+
+def _give_weights(name: str, agent: Agent) -> None:
+    """Let an agent begin with the weights of a policy."""
+    policy = load_policy(name, device="cpu")
+    given, steps = policy.give_weights(agent), policy.metadata.get("steps")
+    origin, new = f"{policy.env_id}, {steps} steps", len(agent.state_dict()) - given
+    log.info("begin with %d weights of %s (%s); %d are new", given, name, origin, new)
+
+
 def for_experiment(config: TrainConfig, experiment: Experiment) -> TrainConfig:
-    """Return the config with what the experiment decides: senses and vocabulary."""
+    """Return the config with what the experiment decides: senses and vocabulary.
+
+    An agent that reads any text keeps the words of the weights it begins with.
+    """
     senses, words = config.agent.senses or experiment.senses, experiment.vocabulary
+    if config.init_from and "instruction" not in encoder_of(config.agent).reads:
+        words = config.agent.vocabulary
     agent = dataclasses.replace(config.agent, senses=senses, vocabulary=words)
     return dataclasses.replace(config, agent=agent)
 
