@@ -342,6 +342,7 @@ def test_a_new_run_begins_with_the_weights_that_act(
     assert not torch.equal(learning["critic.value.0.weight"], critic)
     told = f"begin with {len(acting)} weights of {before} (Toy-v1, {UPDATE} steps); "
     assert told + f"{len(learning)} are new" in caplog.messages
+    assert (tmp_path / "new/evaluations.csv").read_text().splitlines()[1][:2] == "0,"
 
 
 @pytest.mark.parametrize(

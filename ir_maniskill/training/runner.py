@@ -94,6 +94,8 @@ class Runner:
         silent = distributed.rank() > 0
         bar = tqdm(total=total, initial=self.steps, unit=" steps", disable=silent)
         with bar, self._kept_at_last():
+            if self.steps == 0 and self.config.init_from is not None:
+                self.evaluate()  # the best may be what it begins with
             while True:
                 if self._evaluation_is_due():
                     self.evaluate()
