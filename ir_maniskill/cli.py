@@ -21,6 +21,7 @@ from tyro.conf import Positional, arg, subcommand
 
 from ir_maniskill import api, bench, doctor
 from ir_maniskill import experiment as catalog
+from ir_maniskill.checks import ConfigError
 from ir_maniskill.environment.robots.robot import Robot, available_robots, short_name
 from ir_maniskill.evaluation import plots, video
 from ir_maniskill.evaluation.evaluate import EVALUATION_SEED, write_report
@@ -41,10 +42,6 @@ from ir_maniskill.training.train import beginning_with, for_experiment
 from ir_maniskill.training.train import run as train
 
 TaskId = Positional[Annotated[str, arg(metavar="[MODULE:]ID")]]
-
-
-class UsageError(ValueError):
-    """A request that cannot be carried out: says what was got and what is possible."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,7 +119,7 @@ class _Play:
         task = catalog.get(self.env_id).id
         path = self.checkpoint or shipped(task)
         if self.checkpoint is None and not path.is_file():
-            raise UsageError(
+            raise ConfigError(
                 f"no policy for {task}: none was given and none ships with the package "
                 f"(looked for {path}). Train one: ir-maniskill train {self.env_id}; "
                 f"then add --checkpoint runs/{task}/best.safetensors"
@@ -209,7 +206,7 @@ def _function(name: str) -> Any:
     try:
         return pkgutil.resolve_name(name)
     except (ImportError, AttributeError, ValueError) as error:
-        raise UsageError(
+        raise ConfigError(
             f"--policy: got {name!r}, expected MODULE:FUNCTION that can be imported "
             f"({error})"
         ) from error
@@ -266,7 +263,7 @@ class Talk:
         except ModuleNotFoundError as error:
             if error.name != "viser":
                 raise
-            raise UsageError(
+            raise ConfigError(
                 "talk: got no module 'viser', expected it installed: "
                 "pip install 'ir-maniskill[talk]'"
             ) from None
@@ -356,7 +353,7 @@ def run(arguments: Sequence[str]) -> int:
         return command.run() or 0
     except KeyboardInterrupt:
         return 130
-    except (ValueError, RuntimeError, OSError, catalog.UnknownExperimentError) as error:
+    except (ValueError, RuntimeError, OSError) as error:
         print(f"ir-maniskill: error: {_in_one_line(error)}", file=sys.stderr)
         return 2
 
@@ -381,7 +378,7 @@ def parse(arguments: Sequence[str]) -> Any:
     ahead.add_argument("--preset", nargs="?")
     preset = ahead.parse_known_args(list(arguments))[0].preset
     if preset is not None and preset not in CONFIGS:
-        raise UsageError(f"--preset: got {preset!r}, available: {', '.join(CONFIGS)}")
+        raise ConfigError(f"--preset: got {preset!r}, available: {', '.join(CONFIGS)}")
     defaults = CONFIGS[preset or "default"]
     command = _parse(arguments, defaults)
     if not isinstance(command, Train):

@@ -47,14 +47,6 @@ class ExperimentError(GoalError):
     """An experiment is malformed: says what was got and what was expected."""
 
 
-class UnknownExperimentError(KeyError):
-    """No experiment has that id: says which there are."""
-
-    def __str__(self) -> str:
-        """Return the message as it is (`KeyError` would quote it)."""
-        return str(self.args[0])
-
-
 _require = partial(checks.require, error=ExperimentError)
 _require_choice = partial(checks.require_choice, error=ExperimentError)
 _require_type = partial(checks.require_type, error=ExperimentError)
@@ -421,21 +413,20 @@ def get(experiment_id: str) -> Experiment:
     first, so that it can register its tasks.
 
     Raises:
-        ExperimentError: It is no id, or the module cannot be imported.
-        UnknownExperimentError: There is none; the message lists those there are.
+        ExperimentError: There is none, and the message lists those there are; or the
+            module cannot be imported.
     """
     _require_type("task id", experiment_id, str)
     module, _, experiment_id = experiment_id.rpartition(":")
     if module:
         _import(module)
-    try:
-        return _CATALOG[experiment_id]
-    except KeyError:
-        raise UnknownExperimentError(
+    if experiment_id not in _CATALOG:
+        raise ExperimentError(
             f"unknown task id: got {experiment_id!r}, "
             f"available: {', '.join(available())}; for a task of your own write "
             "MODULE:ID, where MODULE registers it"
-        ) from None
+        )
+    return _CATALOG[experiment_id]
 
 
 def _import(module: str) -> None:

@@ -247,7 +247,7 @@ def test_an_option_that_is_mistyped_is_told_of(fixed: gym.Env) -> None:
 def test_unknown_ids_and_modes_are_refused() -> None:
     with pytest.raises(gym.error.NameNotFound):
         gym.make("NaoTouchCubeSolo-v1")
-    with pytest.raises(catalog.UnknownExperimentError, match="available: NaoTouch"):
+    with pytest.raises(catalog.ExperimentError, match="available: NaoTouch"):
         TouchEnv(experiment="NaoTouchCubeSolo-v1")
     with pytest.raises(NotImplementedError, match="smell"):
         gym.make("NaoTouchCubeSingle-v1", reward_mode="smell", render_backend="none")

@@ -340,9 +340,8 @@ def test_wrong_actions_are_refused_and_no_env_steps(
     ],
 )
 def test_envs_that_cannot_be_are_not_made(kwargs: dict, message: str) -> None:
-    with pytest.raises(Exception, match=message) as caught:
+    with pytest.raises(ValueError, match=message):
         make_vec(**{"task_id": TASK, "num_envs": 2} | kwargs)
-    assert isinstance(caught.value, ValueError | catalog.UnknownExperimentError)
 
 
 def test_answers_of_different_commands_cannot_get_mixed(envs: ProcessVectorEnv) -> None:

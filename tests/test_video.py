@@ -5,6 +5,7 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 
+from ir_maniskill.checks import ConfigError
 from ir_maniskill.environment.robots.nao import HANDS
 from ir_maniskill.evaluation import plots, video
 from ir_maniskill.evaluation.evaluate import evaluate_policy
@@ -259,8 +260,8 @@ def test_learning_curve_draws_a_run(tmp_path):
 
 
 def test_learning_curve_of_no_run_or_a_broken_one_says_so(tmp_path):
-    with pytest.raises(plots.PlotError, match=r"no metrics.csv"):
+    with pytest.raises(ConfigError, match=r"no metrics.csv"):
         plots.learning_curve(tmp_path)
     (tmp_path / "metrics.csv").write_text("steps,train/return\n1,many\n")
-    with pytest.raises(plots.PlotError, match="expected a table of numbers"):
+    with pytest.raises(ConfigError, match="expected a table of numbers"):
         plots.learning_curve(tmp_path)

@@ -100,9 +100,8 @@ class TouchEnv(RenderedEnv):
             **kwargs: As for `BaseEnv`.
 
         Raises:
-            UnknownExperimentError: There is no experiment of that id.
-            ExperimentError: It is no experiment, or its goals or places don't fit
-                the robot.
+            ExperimentError: There is no such experiment, or its goals or places don't
+                fit the robot.
             RobotError: The robot cannot be used.
             ValueError: Several envs are asked for, but physics is on the CPU; or there
                 is nothing of that name to observe.

@@ -44,8 +44,7 @@ def make_vec(
         **env_kwargs: As for `gym.make(task_id)`.
 
     Raises:
-        UnknownExperimentError: There is no task of that id.
-        ExperimentError: The task has no such split.
+        ExperimentError: There is no task of that id, or it has no such split.
         ValueError: A number is out of range, or there is no such backend here.
         WorkerError: Worker processes cannot be started, or one failed to make its envs.
         OSError: There is too little shared memory.

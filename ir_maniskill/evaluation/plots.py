@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ir_maniskill.checks import ConfigError
 from ir_maniskill.evaluation.audit import AuditReport
 from ir_maniskill.files import replacing
 from ir_maniskill.training.run_folder import whole_rows
@@ -27,10 +28,6 @@ INK = "#24292f"
 """Axes and text."""
 
 
-class PlotError(ValueError):
-    """A run that cannot be drawn: what was got, what is expected."""
-
-
 def learning_curve(run: Path, out: Path | None = None) -> Path:
     """Draw success and return over the steps of a run, and return the picture's file.
 
@@ -42,11 +39,13 @@ def learning_curve(run: Path, out: Path | None = None) -> Path:
         out: Picture to write; None: learning_curve.png in the folder.
 
     Raises:
-        PlotError: The folder holds no metrics.
+        ConfigError: The folder holds no metrics.
     """
     metrics = _read(run / "metrics.csv")
     if not metrics:
-        raise PlotError(f"{run}: got no metrics.csv with rows, expected a run's folder")
+        raise ConfigError(
+            f"{run}: got no metrics.csv with rows, expected a run's folder"
+        )
     evaluations = _read(run / "evaluations.csv")
     figure = Figure(figsize=(8.0, 5.6), dpi=150, layout="constrained")
     shares, returns = _panels(figure, heights=(2, 1))
@@ -118,7 +117,9 @@ def _read(table: Path) -> list[Row]:
     except FileNotFoundError:
         return []
     except ValueError as error:
-        raise PlotError(f"{table}: got {error}, expected a table of numbers") from error
+        raise ConfigError(
+            f"{table}: got {error}, expected a table of numbers"
+        ) from error
 
 
 def _points(
