@@ -5,6 +5,7 @@ Legend: I instructions, N envs, L tokens, B bytes, F fingers, C objects.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from numbers import Real
@@ -53,13 +54,9 @@ class InstructionalSet:
     ) -> None:
         fixed = experiment.instructions
         own = () if isinstance(fixed, Spoken) else fixed
-        self.instructions: list[Instruction] = [*own, *[UNTOLD] * num_envs]
+        self._experiment, self._size = experiment, len(own)
         self._hands, self._device = hands, device
-        self._vocabulary, self._size = experiment.vocabulary, len(own)
-        texts, length = [i.text for i in self.instructions], experiment.max_tokens
-        self.tokens = self._tokens(texts, length).to(device)
-        self.text = text_of(texts, TEXT_BYTES).to(device)
-        self._build()
+        self._write([*own, *[UNTOLD] * num_envs])
 
     def __len__(self) -> int:
         """Return the number of the experiment's own: I."""
@@ -69,42 +66,32 @@ class InstructionalSet:
         """Map uniform numbers in [0, 1) to the experiment's own [N] int64."""
         return (uniform * len(self)).long().clamp(max=len(self) - 1)
 
-    def tell(self, said: Mapping[int, Instruction]) -> dict[int, int]:
-        """Write down what envs were told; return the row of each.
+    def told(self, said: Mapping[int, Instruction]) -> InstructionalSet:
+        """Return the set in which some envs, by their places, were told something.
 
         Raises:
             GoalError: A sentence is too long for the observation, or asks for a hand
-                that the robot does not have; then nothing was written.
+                that the robot does not have.
         """
-        length = self.tokens.shape[1]
-        texts = [instruction.text for instruction in said.values()]
-        tokens, text = self._tokens(texts, length), text_of(texts, TEXT_BYTES)
-        before = list(self.instructions)
-        rows = {env: self._size + env for env in said}
-        for env, row in rows.items():
-            self.instructions[row] = said[env]
-        try:
-            self._build()
-        except GoalError:
-            self.instructions = before
-            raise
-        at = torch.tensor(list(rows.values()), device=self._device)
-        self.tokens[at] = tokens.to(self._device)
-        self.text[at] = text.to(self._device)
-        return rows
+        instructions, other = list(self.instructions), copy.copy(self)
+        for env, instruction in said.items():
+            instructions[self._size + env] = instruction
+        other._write(instructions)
+        return other
 
-    def _build(self) -> None:
-        goals = [instruction.goal for instruction in self.instructions]
-        self.goals = GoalTable(goals, self._hands, self._device)
-
-    def _tokens(self, texts: Sequence[str], length: int) -> Tensor:
+    def _write(self, instructions: list[Instruction]) -> None:
+        length, device = self._experiment.max_tokens, self._device
+        texts = [instruction.text for instruction in instructions]
         for text in texts:
             if len(split_words(text)) > length:
                 raise GoalError(
                     f"instruction text: got {text!r}, expected at most {length} words "
                     "and full stops in this task"
                 )
-        return tokens_of(texts, self._vocabulary, length)
+        self.instructions = instructions
+        self.tokens = tokens_of(texts, self._experiment.vocabulary, length).to(device)
+        self.text = text_of(texts, TEXT_BYTES).to(device)
+        self.goals = GoalTable([i.goal for i in instructions], self._hands, device)
 
 
 UNTOLD = Instruction("", Touch(Ref()))

@@ -6,6 +6,7 @@ Legend: N envs, b envs being reset, J joints, F fingers, C objects, L tokens.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -36,7 +37,7 @@ from ir_maniskill.environment.robots.robot import Robot, available_robots, find_
 from ir_maniskill.environment.speaker import Speaker
 from ir_maniskill.environment.table_objects import TableObjects
 from ir_maniskill.experiment import Experiment, ExperimentError, Spoken
-from ir_maniskill.goals import GoalError, Instruction
+from ir_maniskill.goals import Instruction
 from ir_maniskill.snapshot import Snapshot, later
 
 CONTROL_FREQ = 20
@@ -196,13 +197,14 @@ class TouchEnv(RenderedEnv):
             told = instructions_of(told, self.experiment, len(env_idx))
         if self._speaker is None:
             slot, xy = self._layout.lay_out(layout)
-            index = self.instructional_set.pick(self._tensor(pick[:, 0]))
         else:
             streams = [self._batched_episode_rng[env] for env in env_idx.tolist()]
             slot, xy, told = self._speaker.draw(streams, told)
-        if told is not None:
-            index = self._tell(env_idx, told)
-        self.instruction_index = self.instruction_index.index_put((env_idx,), index)
+        if told is None:
+            index = self.instructional_set.pick(self._tensor(pick[:, 0]))
+            self.instruction_index = self.instruction_index.index_put((env_idx,), index)
+        else:
+            self.instructional_set, self.instruction_index = self._told(env_idx, told)
         self._place_objects(env_idx, slot, xy, 2 * yaw - 1)
         jitter = self._tensor(2 * joint - 1) * self.experiment.jitter.joints
         jitter = jitter * self.agent.jitter_unit
@@ -211,15 +213,15 @@ class TouchEnv(RenderedEnv):
         self._touch.clear(env_idx)
         self._drawing = False
         self._begin(env_idx)
+        self._resolve_goals()
 
     def _begin(self, env_idx: Tensor) -> None:
-        """Forget successes and fouls, and look up what sentences refer to."""
+        """Forget successes and fouls."""
         # Not in place: the info of the last step holds these very tensors.
         self._success_once = self._success_once.index_fill(0, env_idx, False)
         self._wrong_once = self._wrong_once.index_fill(0, env_idx, False)
         self._stage = self._stage.index_fill(0, env_idx, 0)
         self._stepped = False
-        self._resolve_goals()
 
     def _resolve_goals(self) -> None:
         """Look up what the sentences of all envs refer to, as their episodes began."""
@@ -266,27 +268,26 @@ class TouchEnv(RenderedEnv):
         if env_idx is None:
             env_idx = torch.arange(self.num_envs, device=self.device)
         told = instructions_of(said, self.experiment, len(env_idx))
-        kept = self.get_state_dict()["task"]
+        known, index = self._told(env_idx, told)
         start = self._start.clone()
         start[env_idx] = self.table.poses()[env_idx]
-        try:
-            index = self._tell(env_idx, told)
-            self.instruction_index = self.instruction_index.index_put((env_idx,), index)
-            self._start = start
-            self._begin(env_idx)
-        except GoalError:
-            self._set_task_state(kept, slice(None))
-            raise
+        scene = replace(self.snapshot(), start=start / self._size)
+        self._goals = known.goals.deal(index, scene)  # what fits no object ends here
+        self.instructional_set, self.instruction_index = known, index
+        self._start = start
+        self._begin(env_idx)
 
-    def _tell(self, env_idx: Tensor, said: Sequence[Instruction]) -> Tensor:
-        """Return the Instructional Set's rows of what envs are told [b] int64."""
-        own, count = self.instructional_set.instructions, len(self.instructional_set)
-        found = {instruction: row for row, instruction in enumerate(own[:count])}
-        envs = env_idx.tolist()
-        new = {e: i for e, i in zip(envs, said, strict=True) if i not in found}
-        rows = self.instructional_set.tell(new) if new else {}
-        index = [rows[e] if e in rows else found[said[k]] for k, e in enumerate(envs)]
-        return torch.tensor(index, device=self.device)
+    def _told(
+        self, env_idx: Tensor, said: Sequence[Instruction]
+    ) -> tuple[InstructionalSet, Tensor]:
+        """Return the Instructional Set once envs were told this, and all rows [N]."""
+        known = self.instructional_set
+        own, envs = known.instructions[: len(known)], env_idx.tolist()
+        each = list(zip(envs, said, strict=True))
+        rows = [own.index(i) if i in own else len(own) + env for env, i in each]
+        index = self.instruction_index.clone()
+        index[env_idx] = torch.tensor(rows, device=self.device)
+        return known.told({env: i for env, i in each if i not in own}), index
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.as_tensor(array, dtype=torch.float32, device=self.device)
@@ -499,7 +500,8 @@ class TouchEnv(RenderedEnv):
         if not torch.equal(text, self.instructional_set.text[-self.num_envs :]):
             said = {e: s for e, s in enumerate(senses.read_text(text)) if s}
             told = instructions_of(list(said.values()), self.experiment, len(said))
-            self.instructional_set.tell(dict(zip(said, told, strict=True)))
+            told_then = dict(zip(said, told, strict=True))
+            self.instructional_set = self.instructional_set.told(told_then)
 
     def set_state(self, state: Tensor, env_idx: Tensor | None = None) -> None:
         """Restore what `get_state` returned: the same, as one flat row per env."""
