@@ -390,20 +390,8 @@ def scene_of(objects: Iterable[TouchObject]) -> Snapshot:
     )
 
 
-_CATALOG: dict[str, Experiment] = {}
-
-
-def add(experiment: Experiment) -> None:
-    """Put an experiment into the catalog.
-
-    Raises:
-        ExperimentError: Another experiment has that id already.
-    """
-    if _CATALOG.setdefault(experiment.id, experiment) != experiment:
-        raise ExperimentError(
-            f"experiment id: got {experiment.id!r}, which is taken; "
-            "register yours under another id"
-        )
+CATALOG: dict[str, Experiment] = {}
+"""All experiments by their ids; `ir_maniskill.register` adds them."""
 
 
 def get(experiment_id: str) -> Experiment:
@@ -420,13 +408,13 @@ def get(experiment_id: str) -> Experiment:
     module, _, experiment_id = experiment_id.rpartition(":")
     if module:
         _import(module)
-    if experiment_id not in _CATALOG:
+    if experiment_id not in CATALOG:
         raise ExperimentError(
             f"unknown task id: got {experiment_id!r}, "
             f"available: {', '.join(available())}; for a task of your own write "
             "MODULE:ID, where MODULE registers it"
         )
-    return _CATALOG[experiment_id]
+    return CATALOG[experiment_id]
 
 
 def _import(module: str) -> None:
@@ -442,7 +430,7 @@ def _import(module: str) -> None:
 
 def available() -> tuple[str, ...]:
     """Return the ids of all experiments, in the order they were registered."""
-    return tuple(_CATALOG)
+    return tuple(CATALOG)
 
 
 def _require_number(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import gymnasium as gym
-from mani_skill.utils.registration import REGISTERED_ENVS, register_env
+from mani_skill.utils.registration import register_env
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.touch_env import TouchEnv
@@ -22,13 +22,14 @@ def register(experiment: Experiment) -> Experiment:
         ExperimentError: Another experiment, or a task of another package, has that id
             already.
     """
-    if experiment.id in gym.registry and experiment.id not in catalog.available():
+    taken = experiment.id in gym.registry
+    if taken and catalog.CATALOG.get(experiment.id) != experiment:
         raise ExperimentError(
-            f"experiment id: got {experiment.id!r}, which is taken by another package; "
+            f"experiment id: got {experiment.id!r}, which is taken; "
             "register yours under another id"
         )
-    catalog.add(experiment)
-    if experiment.id not in REGISTERED_ENVS:
+    catalog.CATALOG[experiment.id] = experiment
+    if not taken:
         register_env(
             experiment.id,
             max_episode_steps=experiment.episode_steps,

@@ -69,9 +69,9 @@ def test_unknown_id_lists_what_there_is() -> None:
 
 def test_an_id_cannot_be_taken_twice() -> None:
     single = catalog.get("NaoTouchCubeSingle-v1")
-    catalog.add(single)  # the same again is fine
+    ir_maniskill.register(single)  # the same again is fine
     with pytest.raises(ExperimentError, match="is taken"):
-        catalog.add(dataclasses.replace(single, episode_steps=64))
+        ir_maniskill.register(dataclasses.replace(single, episode_steps=64))
 
 
 @pytest.mark.parametrize("task_id", ["PickCube-v1", "CartPole-v1"])
