@@ -38,10 +38,10 @@ def official(folder: Path) -> Path:
     robot = ET.Element("robot", name="NaoH25V50")
     motor = ET.SubElement(robot, "transmission", name="LShoulderPitch_Transmission")
     ET.SubElement(motor, "joint", name="LShoulderPitch")
-    robot.extend(joint(row) for row in facts.read_joints().values())
+    robot.extend(joint(row) for row in facts.read("joints"))
     inertials = {row["link"]: row for row in facts.read("links")}
     ends = ("parent_link", "child_link")
-    names = {row[end] for row in facts.read_joints().values() for end in ends}
+    names = {row[end] for row in facts.read("joints") for end in ends}
     robot.extend(link(name, inertials.get(name)) for name in sorted(names))
     path = folder / "nao_description" / "urdf" / "nao.urdf"
     path.parent.mkdir(parents=True)

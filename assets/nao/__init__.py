@@ -1,4 +1,4 @@
-"""The NAO V5 model: a URDF and low-poly meshes, both written by `build.py`."""
+"""The NAO V5 model: a URDF, and low-poly meshes that `build.py` writes."""
 
 from pathlib import Path
 
