@@ -105,11 +105,11 @@ class Rows(list):
     """Stands in for `play`: remembers what was played, and every second succeeds."""
 
     def __call__(self, player, envs, told, seeds, progress=False):
-        self.append((list(told), list(seeds)))
+        self.append(([TASK.sentences.index(i.text) for i in told], list(seeds)))
         figures = torch.ones(len(told), 7, dtype=torch.float64)
         figures[:, :2] = 0
         figures[::2, :2] = 1
-        return figures, [TASK.sentences[index] for index in told]
+        return figures, [instruction.text for instruction in told]
 
 
 def test_each_row_plays_the_same_episodes(monkeypatch, multi_vec, caplog):

@@ -10,9 +10,12 @@ import ir_maniskill
 from ir_maniskill.evaluation import evaluate
 from ir_maniskill.evaluation.audit import same_scene
 from ir_maniskill.evaluation.evaluate import Rate, evaluate_policy, player_of
+from ir_maniskill.goals import Instruction
+from ir_maniskill.language import parse
 
 STEPS = 4
 SENTENCES = ("Touch the blue cube.", "Touch the red cube.")
+TOLD = tuple(Instruction(text, parse(text)) for text in SENTENCES)
 
 
 class ScriptedEnvs:
@@ -23,14 +26,16 @@ class ScriptedEnvs:
     """
 
     device = torch.device("cpu")
-    experiment = SimpleNamespace(id="Scripted-v1", sentences=SENTENCES)
+    experiment = SimpleNamespace(
+        id="Scripted-v1", sentences=SENTENCES, instructions=TOLD
+    )
 
     def __init__(self, num_envs):
         self.num_envs, self.resets = num_envs, []
 
     def reset(self, *, seed=None, options=None):
         self.seed = torch.tensor(seed)
-        self.told = torch.tensor(options["instruction"])
+        self.told = torch.tensor([TOLD.index(i) for i in options["instruction"]])
         self.resets.append((seed, self.told.tolist()))
         self.t = 0
         self.once = torch.zeros(self.num_envs, dtype=torch.bool)
@@ -139,9 +144,9 @@ def test_episodes_have_pinned_seeds_and_instructions_in_turn():
         ({"episodes": 0}, "expected at least"),
         (
             {"episodes": 4, "instructions": [2]},
-            "got .2., available: 0: 'Touch the blue",
+            "got .2., expected an index from 0 to 1, one of .'Touch the blue",
         ),
-        ({"episodes": 4, "instructions": []}, "available"),
+        ({"episodes": 4, "instructions": []}, "expected at least one"),
     ],
 )
 def test_impossible_requests_are_refused(kwargs, message):

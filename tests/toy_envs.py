@@ -67,6 +67,7 @@ class ToyVectorEnv:
         self.experiment = SimpleNamespace(
             id=env_id,
             sentences=SENTENCES,
+            instructions=TASK.instructions,
             senses=senses,
             vocabulary=VOCABULARY,
         )
@@ -82,7 +83,8 @@ class ToyVectorEnv:
             self.streams = [np.random.default_rng(one) for one in each]
         self._start(torch.ones(self.num_envs, dtype=torch.bool))
         if options:
-            self.told[:] = torch.tensor(options["instruction"])
+            told = [SENTENCES.index(said.text) for said in options["instruction"]]
+            self.told[:] = torch.tensor(told)
         return self._observe(), {}
 
     def step(self, action):

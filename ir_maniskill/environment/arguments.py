@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ir_maniskill.experiment import Experiment
+from ir_maniskill.experiment import Experiment, Spoken
 from ir_maniskill.goals import Instruction
 from ir_maniskill.language import SentenceError, parse
 
@@ -56,8 +56,8 @@ def instructions_of(
 ) -> list[Instruction]:
     """Return what each env is told: one instruction for all, or N of them.
 
-    Each is an `Instruction`, an index or a sentence of the experiment's own, or another
-    sentence that the instruction language understands.
+    Each is an `Instruction`, an index or a sentence of the experiment's own (case and
+    full stop do not matter), or another that the instruction language understands.
 
     Raises:
         ValueError: It is something else, or a sentence that is not understood.
@@ -82,16 +82,21 @@ def instructions_of(
 
 def _instruction(given: Any, experiment: Experiment) -> Instruction:
     """Return what is meant; SentenceError or LookupError: nothing."""
-    own = experiment.instructions if experiment.sentences else ()
+    own = experiment.instructions
+    own = () if isinstance(own, Spoken) else own
     if isinstance(given, Instruction):
         return given
-    if given in experiment.sentences:
-        given = experiment.sentences.index(given)
     if isinstance(given, str):
-        return Instruction(given, parse(given))
-    if _whole(given) and isinstance(own, tuple) and given in range(len(own)):
+        same = (i for i in own if _bare(i.text) == _bare(given))
+        return next(same, None) or Instruction(given, parse(given))
+    if _whole(given) and given in range(len(own)):
         return own[given]
     raise LookupError
+
+
+def _bare(sentence: str) -> str:
+    """Return a sentence without what may be left out: capitals and the full stop."""
+    return sentence.lower().strip().rstrip(".")
 
 
 def options_of(

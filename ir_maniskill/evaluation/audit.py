@@ -37,6 +37,7 @@ from ir_maniskill.environment.vector import GpuVectorEnv, VectorEnv
 from ir_maniskill.evaluation.evaluate import (
     Player,
     Rate,
+    choose_instructions,
     play,
     score_by_name,
 )
@@ -145,8 +146,8 @@ def audit(
 def _all_rows(
     player: Player, task: Experiment, make: Make, episodes: int, seed: int
 ) -> Iterator[list[Row]]:
-    count, seeds = len(task.sentences), range(seed, seed + episodes)
-    told = [e % count if count else None for e in range(episodes)]
+    own, seeds = choose_instructions(task, None), range(seed, seed + episodes)
+    told = [own[e % len(own)] for e in range(episodes)]
     with closing(make()) as envs:
         figures, names = play(player, envs, told, seeds)
         yield [_row("who", "the policy", figures)]
@@ -159,8 +160,8 @@ def _all_rows(
         for name, change in controls(task, envs.single_observation_space).items():
             changed, _ = play(_changed(player, change), envs, told, seeds)
             yield [_row("without", name, changed)]
-        if count != 1:
-            scenes = max(1, episodes // (count or SENTENCES))
+        if len(task.sentences) != 1:
+            scenes = max(1, episodes // (len(task.sentences) or SENTENCES))
             yield same_scene(player, envs, scenes=scenes, seed=seed)
     for split in SPLITS[1:] if isinstance(task.instructions, Spoken) else ():
         with closing(make(split=split)) as envs:
@@ -189,7 +190,7 @@ def at_random(envs: VectorEnv) -> Player:
 
 
 def _scripted(
-    envs: VectorEnv, told: Sequence[int | None], seeds: Sequence[int]
+    envs: VectorEnv, told: Sequence[Instruction | None], seeds: Sequence[int]
 ) -> Tensor:
     """Return the figures of the scripted solution, with the robot of the envs."""
     with closing(blind(envs.experiment, robot_of(envs))) as alone:
@@ -336,11 +337,11 @@ def same_scene(player: Player, envs: VectorEnv, *, scenes: int, seed: int) -> li
 
 def _told_in_each(
     envs: VectorEnv, seeds: Sequence[int]
-) -> Iterator[tuple[int, int | Instruction]]:
+) -> Iterator[tuple[int, Instruction]]:
     """Yield each scene's seed with each of its sentences."""
-    count = len(envs.experiment.sentences)
-    if count:
-        yield from ((seed, index) for index in range(count) for seed in seeds)
+    own = envs.experiment.instructions
+    if not isinstance(own, Spoken):
+        yield from ((seed, one) for one in own for seed in seeds)
         return
     with closing(blind(envs.experiment, robot_of(envs))) as alone:
         for seed in seeds:

@@ -22,11 +22,13 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from ir_maniskill.checks import require
 from ir_maniskill.environment.arguments import instructions_of
 from ir_maniskill.environment.senses import Observation, State, StateStack
 from ir_maniskill.environment.vector import VectorEnv, info_of_step
-from ir_maniskill.experiment import Experiment
+from ir_maniskill.experiment import Experiment, Spoken
 from ir_maniskill.files import write_json
+from ir_maniskill.goals import Instruction
 from ir_maniskill.language import KINDS, kind_of
 
 Policy = Callable[[State], Tensor]
@@ -156,7 +158,7 @@ def evaluate_policy(
     episodes: int,
     seed: int,
     frames: int = 3,
-    instructions: Sequence[int | str] | None = None,
+    instructions: Sequence[Any] | None = None,
     progress: bool = False,
 ) -> EvaluationReport:
     """Play episodes with a policy and count what it does.
@@ -170,11 +172,12 @@ def evaluate_policy(
         episodes: How many episodes; at least one for each instruction.
         seed: Seed of the first episode.
         frames: S, observations stacked into a state.
-        instructions: Which of the experiment's instructions; None: all.
+        instructions: What to say, as a reset takes it; None: all that the experiment
+            has.
         progress: Whether to show a progress bar.
 
     Raises:
-        ValueError: Too few episodes, or an instruction that the task does not have.
+        ValueError: Too few episodes, or an instruction that nobody understands.
     """
     chosen = choose_instructions(envs.experiment, instructions)
     if episodes < len(chosen):
@@ -249,35 +252,18 @@ def machine() -> dict[str, Any]:
 
 
 def choose_instructions(
-    experiment: Experiment, wanted: Sequence[int | str] | None
-) -> tuple[int | str | None, ...]:
-    """Return which instructions to play, as a reset takes them.
-
-    Args:
-        experiment: The task, with I sentences of its own or spoken ones.
-        wanted: Which, by index or, but for its case and its full stop, by the sentence;
-            None: all. Spoken ones are texts; None: each episode draws its own.
+    experiment: Experiment, wanted: Sequence[Any] | None
+) -> tuple[Instruction | None, ...]:
+    """Return what to say: what is wanted, else all; None: each episode draws its own.
 
     Raises:
-        ValueError: None is wanted, or one that there is not.
+        ValueError: Nothing is wanted, or something that nobody understands.
     """
-    sentences = experiment.sentences
-    if not sentences:
-        if wanted is not None:
-            instructions_of(list(wanted), experiment, len(wanted))
-        return (None,) if wanted is None else tuple(wanted)
-    known = {_plain(sentence): index for index, sentence in enumerate(sentences)}
-    found = range(len(sentences)) if wanted is None else wanted
-    chosen = tuple(known.get(_plain(i), -1) if isinstance(i, str) else i for i in found)
-    if not chosen or any(index not in range(len(sentences)) for index in chosen):
-        listed = ", ".join(f"{i}: {s!r}" for i, s in enumerate(sentences))
-        got = ", ".join(map(repr, found))
-        raise ValueError(f"instructions: got ({got}), available: {listed}")
-    return chosen
-
-
-def _plain(sentence: str) -> str:
-    return sentence.lower().strip().rstrip(".")
+    own = experiment.instructions
+    if wanted is None:
+        return (None,) if isinstance(own, Spoken) else own
+    require(len(wanted) > 0, "instructions", wanted, "at least one")
+    return tuple(instructions_of(list(wanted), experiment, len(wanted)))
 
 
 FIGURES = (
@@ -303,7 +289,7 @@ def threads(count: int) -> Iterator[None]:
 def play(
     player: Player,
     envs: VectorEnv,
-    told: Sequence[Any],
+    told: Sequence[Instruction | None],
     seeds: Sequence[int],
     progress: bool = False,
 ) -> tuple[Tensor, list[str]]:
@@ -312,7 +298,7 @@ def play(
     Args:
         player: Acts.
         envs: The task.
-        told: What each episode is told, as a reset takes it; None: what is drawn [E].
+        told: What each episode is told; None: what is drawn [E].
         seeds: Where each starts from [E].
         progress: Whether to show a progress bar.
 
@@ -344,9 +330,8 @@ def play(
 
 def _names(envs: VectorEnv, told: Sequence[Any]) -> list[str]:
     """Return the sentence of each env; where they are spoken, its kind."""
-    sentences = envs.experiment.sentences
-    if sentences:
-        return [sentences[index] for index in told]
+    if not isinstance(envs.experiment.instructions, Spoken):
+        return [instruction.text for instruction in told]
     each = envs.get_attr("instructions")  # of N envs, or of N vectors of one
     said = [i for one in each for i in (one if isinstance(one, list) else [one])]
     return [kind_of(instruction.goal) for instruction in said]

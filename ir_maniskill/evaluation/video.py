@@ -105,7 +105,7 @@ def record(
     seed: int = 0,
     frames: int = 3,
     env_kwargs: dict[str, Any] | None = None,
-    instructions: Sequence[int | str] | None = None,
+    instructions: Sequence[Any] | None = None,
 ) -> Iterator[Snapshot]:
     """Play episodes and yield every step; the arguments are `evaluate_policy`'s.
 
