@@ -39,18 +39,6 @@ def seeds_of(seed: int | Sequence[int], num_envs: int) -> list[int]:
     )
 
 
-def seed_of(seed: Any, num_envs: int) -> int | list[int] | None:
-    """Return what ManiSkill takes: one seed, from which it draws those of N envs, or N.
-
-    Raises:
-        ValueError: There are not N of them, or some are out of range or no integers.
-    """
-    given = _plain(seed)
-    if given is None or (_whole(given) and given in SEEDS):
-        return given
-    return seeds_of(given, num_envs)
-
-
 def instructions_of(
     given: Any, experiment: Experiment, num_envs: int
 ) -> list[Instruction]:

@@ -26,7 +26,7 @@ from ir_maniskill.environment.arguments import (
     action_of,
     instructions_of,
     require_reset,
-    seed_of,
+    seeds_of,
 )
 from ir_maniskill.environment.instructional_set import GoalBatch, InstructionalSet
 from ir_maniskill.environment.layout import layout_of
@@ -304,7 +304,8 @@ class TouchEnv(RenderedEnv):
         same trajectory, bit for bit, whatever happened before.
 
         Args:
-            seed: Seeds of the envs; None goes on with their random streams.
+            seed: Env i gets seed + i, or the i-th of a list; None goes on with their
+                random streams.
             options: ManiSkill's, and "instruction": the sentences to give instead of
                 drawing them, as text or index, one for all envs or b of them.
 
@@ -314,11 +315,12 @@ class TouchEnv(RenderedEnv):
         """
         options = {} if options is None else options
         require_reset(options)
-        options, seed = dict(options), seed_of(seed, self.num_envs)
-        if seed is not None and not self._sim_device.is_cuda():
+        options = dict(options)
+        seeds = None if seed is None else seeds_of(seed, self.num_envs)
+        if seeds is not None and not self._sim_device.is_cuda():
             options.setdefault("reconfigure", True)
-        gym.Env.reset(self, seed=seed if isinstance(seed, int) else None)
-        return super().reset(seed, options)
+        gym.Env.reset(self, seed=None if seeds is None else seeds[0])
+        return super().reset(seeds, options)
 
     def step(self, action: Any) -> tuple[Any, Tensor, Tensor, Tensor, dict]:
         """Step as ManiSkill does, except that success does not end the episode.
