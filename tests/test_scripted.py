@@ -93,5 +93,5 @@ def test_what_is_to_be_left_alone_is_nothing_to_do():
 
 @pytest.mark.parametrize("text", GOALS)
 def test_every_kind_of_goal_is_reached_without_a_foul(envs, scripted, text):
-    figures, _ = play(scripted, envs, [list(GOALS).index(text)], [0])
+    figures, _ = play(scripted, envs, [Instruction(text, GOALS[text])], [0])
     assert torch.equal(figures[0, :2], torch.ones(2, dtype=torch.float64))
