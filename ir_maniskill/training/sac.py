@@ -131,7 +131,7 @@ class SAC(Algorithm):
         require(ranks == 1, "processes", ranks, "1: SAC trains in a single one")
         self.hindsight = hindsight or Hindsight.of(config, config.sac.others)
         self.frames = config.frames
-        self.threads = config.threads or distributed.cores()
+        self._threads = config.threads or distributed.cores()
         self.agent = Agent(config.agent, StateSpec.of(state, actions))
         self.agent.to(state["instruction"].device)
         read = self.agent.encoder.language.reads
@@ -372,7 +372,7 @@ class SAC(Algorithm):
             lambda part: self._imitation(self._seen(rows[part], which[part])),
             len(rows),
             self._weights("agent"),
-            self.threads,
+            self._threads,
         )
         self._step("agent")
         self._note(**means)
