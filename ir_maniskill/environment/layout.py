@@ -49,12 +49,13 @@ class Seats:
         self.places = np.array([thing.position for thing in experiment.bodies])
         self.jitter = experiment.jitter.position
         self.shuffled = experiment.shuffled
-        self.noise = 3 * len(self.places)
+        self.slots = len(self.places)
+        self.noise = 3 * self.slots
         """Uniform numbers that a scene is made of."""
 
     def lay_out(self, noise: np.ndarray) -> Laid:
         """Return scenes, of uniform numbers in [0, 1) [b, 3 C]."""
-        count = len(self.places)
+        count = self.slots
         order, shift = noise[:, :count], noise[:, count:].reshape(-1, count, 2)
         seat = np.argsort(order) if self.shuffled else np.arange(count)
         xy = np.broadcast_to(self.places[seat], shift.shape)
@@ -75,8 +76,8 @@ class Free:
         self.reach = robot.reach / robot.scale
         shoulders = [np.array(place) / robot.scale for place in robot.shoulders]
         self.hands = dict(zip(robot.hands, shoulders, strict=False))
-        self.slots = drawn.count[1]
-        self.noise = 1 + len(drawn.pool) + 2 * self.slots * CANDIDATES
+        self.pool, self.slots = len(drawn.pool), drawn.count[1]
+        self.noise = 1 + self.pool + 2 * self.slots * CANDIDATES
         """Uniform numbers that a scene is made of."""
 
     # -- Where things lie ------------------------------------------------------------
@@ -85,7 +86,7 @@ class Free:
         """Return scenes, of uniform numbers in [0, 1) [b, noise]."""
         fewest, most = self.drawn.count
         count = fewest + (noise[:, :1] * (most - fewest + 1)).astype(int)  # [b, 1]
-        pool, rest = np.split(noise[:, 1:], [len(self.drawn.pool)], axis=1)
+        pool, rest = np.split(noise[:, 1:], [self.pool], axis=1)
         slots = np.argsort(pool)[:, : self.slots]  # [b, C]
         wanted = np.arange(self.slots) < count  # [b, C]
         tried = self._candidates(rest.reshape(len(noise), self.slots, CANDIDATES, 2))

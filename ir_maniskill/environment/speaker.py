@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from random import Random
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,6 +26,19 @@ PATIENCE = 100
 
 BY_HAND = 0.5
 """Share of the sentences of the split `wording` that were written by hand."""
+
+
+class _Wish(NamedTuple):
+    """What a scene is to be drawn for."""
+
+    rng: Random
+    """Draws what is said."""
+    wanted: Instruction | None = None
+    """What is to be said; None: anything."""
+    kind: str = ""
+    """Of which kind, if that can be; empty: of any."""
+    free: bool = False
+    """Whether it may be asked where training would not ask it."""
 
 
 class Speaker:
@@ -56,37 +70,49 @@ class Speaker:
         Raises:
             GoalError: No scene was found of which an instruction is true.
         """
-        wanted = [None] * len(streams) if told is None else told
-        each = [self._draw(*pair) for pair in zip(streams, wanted, strict=True)]
-        slots, places, said = zip(*each, strict=True)
-        return np.stack(slots), np.stack(places), list(said)
-
-    def _draw(
-        self, stream: np.random.RandomState, told: Instruction | None
-    ) -> tuple[np.ndarray, np.ndarray, Instruction]:
-        rng = Random(int(stream.uniform() * 2**53))
-        kind, wanted = rng.choice(self.spoken.kinds), told
-        if told is None and self.spoken.split == "wording" and rng.random() < BY_HAND:
-            wanted = self.by_hand[int(rng.random() * len(self.by_hand))]
+        if told is None:
+            wishes = [self._wish(stream) for stream in streams]
+        else:  # what users ask for need not be in reach
+            rngs = map(_rng, streams)
+            wishes = [_Wish(*pair, free=True) for pair in zip(rngs, told, strict=True)]
+        slots = np.empty((len(wishes), self.layout.slots), dtype=np.int64)
+        places = np.empty((*slots.shape, 2))
+        said: dict[int, Instruction] = {}
         for tried in range(SCENES):
-            slot, xy = self.layout.lay_out(stream.uniform(size=(1, self.layout.noise)))
-            there = self._things(slot[0], xy[0])
-            if wanted is None:
-                # A kind may be impossible, such as two hands for a robot with one.
-                kinds = (kind,) if tried < PATIENCE else self.spoken.kinds
-                instruction = self.say(there, rng, kinds)
-            else:
-                free = told is not None  # what users ask for need not be in reach
-                fits = self.is_true(wanted.goal, there) and (
-                    free or self.can_ask(wanted.goal, there)
-                )
-                instruction = wanted if fits else None
-            if instruction is not None:
-                return slot[0], xy[0], instruction
-        said = self.spoken if wanted is None else repr(wanted.text)
+            left = [i for i in range(len(wishes)) if i not in said]
+            if not left:
+                return slots, places, [said[i] for i in range(len(wishes))]
+            noise = [streams[i].uniform(size=self.layout.noise) for i in left]
+            slots[left], places[left] = self.layout.lay_out(np.stack(noise))
+            for i in left:
+                there = self._things(slots[i], places[i])
+                if answer := self._answer(wishes[i], there, tried):
+                    said[i] = answer
+        wanted = wishes[left[0]].wanted
+        asked = self.spoken if wanted is None else repr(wanted.text)
         raise GoalError(
-            f"instruction: got {said}, expected what is true of one of {SCENES} scenes"
+            f"instruction: got {asked}, expected what is true of one of {SCENES} scenes"
         )
+
+    def _wish(self, stream: np.random.RandomState) -> _Wish:
+        """Return what is to be said in a scene that is yet to be drawn."""
+        rng, split = _rng(stream), self.spoken.split
+        kind = rng.choice(self.spoken.kinds)
+        if split == "wording" and rng.random() < BY_HAND:
+            return _Wish(rng, self.by_hand[int(rng.random() * len(self.by_hand))])
+        return _Wish(rng, kind=kind)
+
+    def _answer(
+        self, wish: _Wish, scene: Sequence[Thing], tried: int
+    ) -> Instruction | None:
+        """Return what is said of a scene; None: it does not do."""
+        if wish.wanted is None:
+            # A kind may be impossible, such as two hands for a robot with one.
+            kinds = [wish.kind] if wish.kind and tried < PATIENCE else ()
+            return self.say(scene, wish.rng, kinds)
+        goal = wish.wanted.goal
+        fits = self.is_true(goal, scene) and (wish.free or self.can_ask(goal, scene))
+        return wish.wanted if fits else None
 
     def _things(self, slot: np.ndarray, xy: np.ndarray) -> list[Thing]:
         """Return the objects that lie there, of slots [C] and places [C, 2]."""
@@ -126,6 +152,10 @@ class Speaker:
             acts.append((verb, index))
         together = [acts] if kind_of(goal) == "both" else [[act] for act in acts]
         return all(map(allows, together))
+
+
+def _rng(stream: np.random.RandomState) -> Random:
+    return Random(int(stream.uniform() * 2**53))
 
 
 def resolve(ref: Ref, scene: Sequence[Thing]) -> int | None:
