@@ -8,7 +8,7 @@ import torch
 from scenes import scene
 
 from ir_maniskill import experiment as catalog
-from ir_maniskill.environment.senses import text_of
+from ir_maniskill.environment.senses import read_text, text_of
 from ir_maniskill.goals import Avoid, Both, Instruction, Push, Ref, Then, Touch
 from ir_maniskill.snapshot import Snapshot
 from ir_maniskill.training.config import CONFIGS
@@ -82,6 +82,16 @@ def test_a_listed_task_is_judged_under_its_own_sentences() -> None:
     assert {each.text for each in found} == set(SHUFFLED.sentences)
     read = hindsight.read(found, {"instruction": 7})
     assert read["instruction"].shape == (3, 7)
+
+
+def test_spoken_sentences_are_read_as_they_are_and_loosely() -> None:
+    torch.manual_seed(0)
+    hindsight = Hindsight.of(dataclasses.replace(LISTEN, env_id="NaoInstruct-v1"), 4)
+    plain = "Could you touch the object that is green with your left hand?"
+    read = hindsight.read([hindsight.said(plain)] * 100, {"text": 200})["text"]
+    said = read_text(read)
+    assert 30 < said.count(plain) < 70
+    assert all("green" in text and "left hand" in text for text in said)
 
 
 def test_sentences_that_came_true_are_preferred() -> None:

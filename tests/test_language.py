@@ -27,12 +27,14 @@ from ir_maniskill.language import (
     Thing,
     draw,
     handwritten,
+    loosely,
     parse,
     say,
     split_of,
     words,
 )
 from ir_maniskill.language.grammar import RULES
+from ir_maniskill.language.splits import EMPTY, NOISE
 from ir_maniskill.language.tokens import split_words
 
 RED, BLUE = Ref("red"), Ref("blue", "cube")
@@ -252,6 +254,30 @@ def test_sentences_written_by_hand_are_new_in_wording_alone():
             assert parse(instruction.text) == instruction.goal, instruction.text
         except SentenceError:
             continue
+
+
+def test_said_loosely_a_sentence_loses_empty_words_alone():
+    rng = Random(0)
+    changed = 0
+    for _, goal in drawn(500, "train", 6):
+        text = say(goal, rng)
+        loose = split_words(loosely(text, rng))
+        meant = [word for word in split_words(text) if word not in EMPTY]
+        assert [word for word in loose if word not in {*EMPTY, NOISE}] == meant
+        assert len(loose) <= len(split_words(text))
+        changed += loose != split_words(text)
+    assert changed > 450
+    assert NOISE not in words("wording")
+
+
+def test_said_loosely_nothing_is_what_was_written_by_hand():
+    rng = Random(0)
+    written = {tuple(split_words(each.text)) for each in handwritten()}
+    assert ("blue", "cube") in written
+    said = {
+        tuple(split_words(loosely("Touch the blue cube.", rng))) for _ in range(999)
+    }
+    assert len(said) > 10 and not said & written
 
 
 def test_no_phrase_is_listed_twice():

@@ -12,6 +12,7 @@ from ir_maniskill.language.splits import (
     SPLITS,
     handwritten,
     kind_of,
+    loosely,
     split_of,
     words,
 )
@@ -27,6 +28,7 @@ __all__ = [
     "draw",
     "handwritten",
     "kind_of",
+    "loosely",
     "parse",
     "say",
     "split_of",

@@ -5,7 +5,9 @@ An object is described by a `Name`, its color and shape, either of which may be 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cache
+from random import Random
 
 from ir_maniskill.goals import (
     FIXED,
@@ -20,7 +22,7 @@ from ir_maniskill.goals import (
     Touch,
 )
 from ir_maniskill.language.grammar import load_json, parse, words_by_mark
-from ir_maniskill.language.tokens import words_of
+from ir_maniskill.language.tokens import split_words, words_of
 
 Name = tuple[str | None, str | None]
 
@@ -38,7 +40,8 @@ VERBS = {
 TEAMS = (("touch", "touch"), ("left hand", "right hand"), ("right hand", "left hand"))
 """Verbs that can be done at the same time."""
 
-_HELD = load_json("grammar.json")["held_out"]
+_GRAMMAR = load_json("grammar.json")
+_HELD = _GRAMMAR["held_out"]
 HELD_OBJECTS = frozenset((color, shape) for color, shape in _HELD["objects"])
 """Colors and shapes that are never named together in training, nor meant."""
 HELD_PAIRS = frozenset((v, color) for v, cs in _HELD["pairs"].items() for color in cs)
@@ -118,6 +121,35 @@ def refs_of(goal: Goal) -> list[Ref]:
 
 
 # -- Words -----------------------------------------------------------------------------
+
+EMPTY = frozenset(_GRAMMAR["empty"])
+"""Words that a sentence of training means the same without."""
+LEFT_OUT, UNKNOWN = 0.5, 0.15
+"""How likely `loosely` leaves out such a word, and has `NOISE` in its place."""
+NOISE = "xyz"
+"""A word that is read as `<unk>`."""
+
+
+def loosely(sentence: str, rng: Random) -> str:
+    """Return a sentence as if typed in haste, and with words that nobody knows.
+
+    A sentence written by hand for the split `wording` never comes of it.
+    """
+    said = []
+    for word in split_words(sentence):
+        luck = rng.random() if word in EMPTY else 1.0
+        if luck >= LEFT_OUT:
+            said.append(NOISE if luck < LEFT_OUT + UNKNOWN else word)
+    return sentence if _core(said) in _written() else " ".join(said)
+
+
+def _core(words: Iterable[str]) -> tuple[str, ...]:
+    return tuple(word for word in words if word not in (".", NOISE))
+
+
+@cache
+def _written() -> frozenset[tuple[str, ...]]:
+    return frozenset(_core(split_words(i.text)) for i in handwritten())
 
 
 @cache

@@ -26,12 +26,14 @@ from ir_maniskill.environment.senses import read_text, text_of, tokens_of
 from ir_maniskill.environment.speaker import Speaker
 from ir_maniskill.experiment import Experiment, Spoken
 from ir_maniskill.goals import SHAPES, Goal, Instruction, Measure
-from ir_maniskill.language import parse, things
+from ir_maniskill.language import loosely, parse, things
 from ir_maniskill.snapshot import Snapshot
 from ir_maniskill.training.config import TrainConfig
 
 SOUGHT = 3
 """How many sentences are judged for each one that is kept."""
+LOOSELY = 0.5
+"""Share of the sentences that are said `loosely`, so that word by word counts."""
 
 
 @dataclass(frozen=True)
@@ -144,8 +146,16 @@ class Hindsight:
     def read(
         self, instructions: Sequence[Instruction], entries: Mapping[str, int]
     ) -> dict[str, Tensor]:
-        """Return the sentences as a state has them [M, ...], in entries so long."""
+        """Return the sentences as a state has them [M, ...], in entries so long.
+
+        Of those that are spoken, some are said `LOOSELY`.
+        """
         texts, read = [instruction.text for instruction in instructions], {}
+        if self.speaker is not None:
+            rng = Random(int(torch.randint(2**31, ())))
+            texts = [
+                loosely(text, rng) if rng.random() < LOOSELY else text for text in texts
+            ]
         if "instruction" in entries:
             words, length = self.experiment.vocabulary, entries["instruction"]
             read["instruction"] = tokens_of(texts, words, length).to(torch.int16)
