@@ -305,8 +305,11 @@ class Push(Goal):
     """Largest share of the way that it may stray to the side."""
     LEVEL = 3.0
     """Level of a whole push: that of a touch with all fingers of one hand of NAO."""
-    BEHIND = 0.04
-    """How far behind its center fingers should be to push it [m]."""
+    BEHIND = 0.02
+    """How far behind its center fingers are drawn to: they can't get there, so they
+    push [m]."""
+    HEIGHT = 2.0
+    """Weight of their height in the gap: from above they slide over it."""
 
     def __post_init__(self) -> None:
         self._check(ref=Ref, distance=Real)
@@ -324,7 +327,8 @@ class Push(Goal):
         strayed = (aside - Push.STRAIGHT * along.clamp(min=0)).clamp(min=0)
         serves = asked.ref[:, None].expand_as(scene.contact)
         behind = -Push.BEHIND * asked.ref[..., None] * asked.direction[:, None]
-        way = (scene.to_object - behind[:, None]).norm(dim=3)
+        x, y, z = (scene.to_object - behind[:, None]).unbind(dim=3)
+        way = (x.square() + y.square() + (Push.HEIGHT * z).square()).sqrt()
         way = way.where(serves, torch.inf).flatten(1).amin(dim=1)
         gap = (asked.distance - along).clamp(min=0) + strayed + way
         gap = gap.masked_fill(holds, 0.0)

@@ -1,6 +1,7 @@
 """Goals on scenes made by hand: what holds, how far it is, what is a foul."""
 
 import dataclasses
+import math
 
 import pytest
 import torch
@@ -118,11 +119,12 @@ def test_with_the_other_hand_a_touch_is_a_foul():
 )
 def test_push_measures_the_way_along_and_to_the_side(moved, holds, gap, level):
     at = scene(moved=moved, which=1)
-    at.fingertip[:, 4] = at.position[:, 1] - torch.tensor([0.03, 0.04, 0.0])
+    at.fingertip[:, 4] = at.position[:, 1] - torch.tensor([0.03, 0.02, 0.02])
     measure, verdict = measured(Push(RED, "left", 0.05), at)
     assert measure.holds.item() == holds
-    # A finger still has 3 cm to go until it is 4 cm behind what it is to push.
-    assert measure.gap.item() == pytest.approx(0 if holds else gap + 0.03, abs=1e-4)
+    # A finger is 3 cm beside the way and 2 cm too low or high, which counts twice.
+    way = math.hypot(0.03, 0.04)
+    assert measure.gap.item() == pytest.approx(0 if holds else gap + way, abs=1e-4)
     assert measure.level.item() == pytest.approx(level)
     assert not verdict.foul
 

@@ -301,7 +301,6 @@ class SAC(Algorithm):
     def _rows(self) -> tuple[Tensor, Tensor]:
         """Return rows [B], and under which of its sentences to see each [B]."""
         which = torch.randint(self.hindsight.sentences, (self.config.batch,))
-        which[torch.rand(len(which)) < self.config.own] = 0
         return self.replay.draw(len(which)), which
 
     def _read(self, rows: Tensor, which: Tensor) -> State:
@@ -356,9 +355,11 @@ class SAC(Algorithm):
     def _improve_teacher(self, now: State) -> None:
         """Do what both critics value, as randomly as the target entropy asks."""
         temperature, known = self.log_temperature.detach().exp(), self._known(now)
-        action, log_prob = self._taught(known).rsample()
+        taught = self._taught(known)
+        action, log_prob = taught.rsample()
         value = self.critics(known, action).amin(dim=0)
-        self._descend("teacher", (temperature * log_prob - value).mean())
+        effort = self.config.effort * taught.mean.square().mean(dim=1)
+        self._descend("teacher", (temperature * log_prob - value + effort).mean())
         entropy = linear(*ENTROPY, max(0.0, 1.5 * self._learned - 0.5))
         excess = -entropy * self.actions - log_prob.detach().mean()
         self._descend("temperature", self.log_temperature.exp() * excess)
