@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ir_maniskill.agent.agent import Act
+from ir_maniskill.agent.critic import Standardize
 from ir_maniskill.environment.senses import State
 from ir_maniskill.training import distributed
 
@@ -153,7 +154,7 @@ class RewardScale:
         """Start without any experience."""
         self.gamma = gamma
         self.running = torch.zeros(num_envs)  # [N] discounted return so far
-        self.count, self.mean, self.variance = 0, 0.0, 1.0
+        self.seen = Standardize(1).double()
 
     def __call__(self, reward: Tensor, done: Tensor) -> Tensor:
         """Return the rewards [T, N] scaled, after taking them into account."""
@@ -163,8 +164,9 @@ class RewardScale:
             returns[t] = running = self.gamma * running + reward[t]
             running = running * ~done[t]
         self.running = running
-        self._update(distributed.gather(returns.double().flatten()))
-        return reward / (self.variance**0.5 + 1e-8)
+        self.seen.update(distributed.gather(returns.double().flatten())[:, None].cpu())
+        # A task without any reward so far has no scale: leave its zeros alone.
+        return reward / (float(self.seen.variance.sqrt()) or 1.0)
 
     def restart(self) -> None:
         """Forget the running returns: every env starts a new episode."""
@@ -172,20 +174,12 @@ class RewardScale:
 
     def state(self) -> Tensor:
         """Return what has to survive a restart of the program [3]."""
-        numbers = (self.count, self.mean, self.variance)
-        return torch.tensor(numbers, dtype=torch.float64)
+        seen = self.seen
+        return torch.cat([seen.count[None], seen.mean, seen.variance])
 
     def load_state(self, state: Tensor) -> None:
         """Go on from what `state` returned."""
-        count, self.mean, self.variance = state.tolist()
-        self.count = int(count)
-
-    def _update(self, returns: Tensor) -> None:
-        count, total = len(returns), self.count + len(returns)
-        shift = float(returns.mean()) - self.mean
-        spread = self.count * self.variance + float(returns.var(correction=0)) * count
-        spread += shift**2 * self.count * count / total
-        # A task without any reward so far has no scale: leave its zeros alone.
-        self.variance = spread / total if spread > 0 else 1.0
-        self.mean += shift * count / total
-        self.count = total
+        count, mean, variance = state.double()
+        self.seen.load_state_dict(
+            {"count": count, "mean": mean[None], "variance": variance[None]}
+        )
