@@ -305,9 +305,8 @@ class Push(Goal):
     """Largest share of the way that it may stray to the side."""
     LEVEL = 3.0
     """Level of a whole push: that of a touch with all fingers of one hand of NAO."""
-    BEHIND = 0.02
-    """How far behind its center fingers are drawn to: they can't get there, so they
-    push [m]."""
+    BEHIND = 0.04
+    """How far behind its center fingers should be to push it [m]."""
     HEIGHT = 2.0
     """Weight of their height in the gap: from above they slide over it."""
 

@@ -119,7 +119,7 @@ def test_with_the_other_hand_a_touch_is_a_foul():
 )
 def test_push_measures_the_way_along_and_to_the_side(moved, holds, gap, level):
     at = scene(moved=moved, which=1)
-    at.fingertip[:, 4] = at.position[:, 1] - torch.tensor([0.03, 0.02, 0.02])
+    at.fingertip[:, 4] = at.position[:, 1] - torch.tensor([0.03, 0.04, 0.02])
     measure, verdict = measured(Push(RED, "left", 0.05), at)
     assert measure.holds.item() == holds
     # A finger is 3 cm beside the way and 2 cm too low or high, which counts twice.

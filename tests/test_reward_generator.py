@@ -104,9 +104,9 @@ def test_fingers_of_the_other_hand_are_not_gathered_and_pushes_may_move():
     terms = reward_terms(at, measure, verdict, torch.zeros(2, dtype=torch.bool))
     far = 1 - math.tanh(RED / 0.1)
     columns = dict(zip(TERMS, terms.T.tolist(), strict=True))
-    # To push to the left, fingers go 2 cm to the right of the object's center.
-    near = 1 - math.tanh(0.02 / 0.1)
-    behind = 1 - math.tanh(math.hypot(0.23, 0.06, 0.05) / 0.1)
+    # To push to the left, fingers go 4 cm to the right of the object's center.
+    near = 1 - math.tanh(0.04 / 0.1)
+    behind = 1 - math.tanh(math.hypot(0.23, 0.04, 0.05) / 0.1)
     expected = [(1 + 2 * far) / 3, (near + 5 * behind) / 6]
     assert columns["gather"] == pytest.approx(expected)
     assert columns["speed"] == pytest.approx([0.3, 0.0])  # cut at 0.3 m/s

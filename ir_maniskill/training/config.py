@@ -115,7 +115,7 @@ class SACConfig:
     """Discount of a step."""
     reward_scale: float = 0.2
     """Factor of rewards, beside which entropy counts."""
-    effort: float = 1.0
+    effort: float = 0.3
     """Weight of the teacher's mean squared action: what need not move stays."""
     polyak: float = 0.005
     """How far the slow critics follow at each gradient."""
