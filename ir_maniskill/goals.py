@@ -408,11 +408,11 @@ class Then(Goal):
     @staticmethod
     def measure(scene: Snapshot, asked: SimpleNamespace) -> Measure:
         """Hold where `a` was reached before and `b` holds now."""
-        later = scene.stage > 0  # [N]
+        begun = scene.stage > 0  # [N], with `b`
         a = asked.a.measure(scene)
         b = asked.b.measure(scene.at_stage((scene.stage - 1).clamp(min=0)))
         first = dataclasses.replace(
-            a, holds=torch.zeros_like(later), stage=a.holds.long()
+            a, holds=torch.zeros_like(begun), stage=a.holds.long()
         )
         second = dataclasses.replace(
             b,
@@ -421,7 +421,7 @@ class Then(Goal):
             may_move=a.may_move | b.may_move,
             stage=1 + b.stage,
         )
-        return Measure.where(later, second, first)
+        return Measure.where(begun, second, first)
 
 
 def _is_sequence(goal: Goal) -> bool:

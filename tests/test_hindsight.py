@@ -74,6 +74,18 @@ def test_critics_are_told_of_every_kind_of_goal_in_as_many_numbers() -> None:
     assert len(torch.unique(goal[0], dim=0)) == 4, "two goals look the same"
 
 
+def test_critics_and_the_acting_teacher_are_told_the_same_of_a_sequence() -> None:
+    then = Then(Touch(Ref("red")), Touch(Ref("blue")))
+    hindsight = sparse()
+    hindsight._listed = tuple(told(then))  # both are touched in the same step
+    rows = [scene(), *(scene((0, 1), (1, 0), stage=stage) for stage in (1, 2))]
+    pursuit, text = Pursuit(hindsight, 1), text_of(["Goal 0."])
+    looks = [pursuit.look(row, text) for row in rows]
+    judged = hindsight.judge(joined(*rows), told(then))
+    assert judged.fouled[:, 0].tolist() == [False, True, True]
+    torch.testing.assert_close(torch.cat(looks), judged.goal[:, 0])
+
+
 def test_a_listed_task_is_judged_under_its_own_sentences() -> None:
     hindsight = Hindsight(SHUFFLED, HANDS, None, others=8)
     found = hindsight.find(scene(), SHUFFLED.sentences[1], 8)

@@ -11,7 +11,7 @@ import torch
 import ir_maniskill
 from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.layout import layout_of
-from ir_maniskill.environment.robots import Nao
+from ir_maniskill.environment.robots import Nao, Panda
 from ir_maniskill.environment.speaker import Speaker, resolve
 from ir_maniskill.experiment import Drawn, Experiment, ExperimentError, Spoken
 from ir_maniskill.goals import COLORS, SHAPES, Instruction, Push, Ref, Touch
@@ -273,6 +273,15 @@ def test_a_sentence_that_fits_no_scene_is_refused(
     text = "Touch the red cube left of the red cube."
     with pytest.raises(ValueError, match=f"got '{text}', expected what is true"):
         env.reset(options={"instruction": text, "reconfigure": False})
+
+
+def test_a_robot_with_one_hand_is_told_what_one_hand_can_do() -> None:
+    task = instruct.ALL.in_split("wording")
+    one, two = (Speaker(task, layout_of(task, robot)) for robot in (Panda, Nao))
+    assert 100 < len(one.by_hand) < len(two.by_hand)
+    streams = [np.random.RandomState(seed) for seed in range(40)]
+    *_, said = one.draw(streams)
+    assert not {kind_of(each.goal) for each in said} & {"hand", "both"}
 
 
 # -- Bad input -------------------------------------------------------------------------

@@ -81,6 +81,22 @@ def test_what_was_kept_in_a_folder_is_there_for_the_next_process(tmp_path) -> No
     assert set(numbers.tolist()) == {0, 1, 2, 20, 21}
 
 
+def test_if_all_rows_are_later_than_the_checkpoint_it_begins_anew(tmp_path) -> None:
+    first = Replay(8)
+    first.keep_in(tmp_path)
+    first.add(episode(0, 4))
+    state = first.state_dict()
+    for begin in (10, 20):
+        first.add(episode(begin, 4))
+
+    second = Replay(8)
+    second.keep_in(tmp_path)
+    second.load_state_dict(state)
+    assert len(second) == 0
+    second.add(episode(30, 4))
+    assert set(second.read("number", second.draw(99)).tolist()) == {30, 31, 32}
+
+
 def test_rows_of_another_layout_are_refused(tmp_path) -> None:
     first = Replay(8)
     first.keep_in(tmp_path)

@@ -1,5 +1,4 @@
 import dataclasses
-from functools import partial
 
 import pytest
 import torch
@@ -9,6 +8,7 @@ from toy_envs import HANDS, LENGTH, TASK, ToyVectorEnv, toy_sac
 
 from ir_maniskill.agent.actor import Squashed
 from ir_maniskill.checks import ConfigError
+from ir_maniskill.environment import senses
 from ir_maniskill.environment.reward_generator import RewardWeights
 from ir_maniskill.environment.senses import StateStack
 from ir_maniskill.training import checkpoint
@@ -23,14 +23,19 @@ def hindsight(others=1):
     return Hindsight(TASK, HANDS, RewardWeights().vector(), others)
 
 
+class Judged(SAC):
+    """It judges the toy task."""
+
+    def __init__(self, config, state, actions):
+        super().__init__(config, state, actions, hindsight=hindsight())
+
+
 def learn(out, steps, **changes):
     """Train on the toy task; return the file of the best policy."""
     envs = ToyVectorEnv(snapshots=True)
     config = toy_sac(out, total_steps=steps, **changes)
-    algorithm = partial(SAC, hindsight=hindsight())
-    return run(
-        config, envs=envs, eval_envs=ToyVectorEnv(snapshots=True), algorithm=algorithm
-    )
+    evaluated_in = ToyVectorEnv(snapshots=True)
+    return run(config, envs=envs, eval_envs=evaluated_in, algorithm=Judged)
 
 
 # -- Parts -----------------------------------------------------------------------------
@@ -77,9 +82,9 @@ def test_its_policy_may_begin_with_anothers_weights(tmp_path, monkeypatch) -> No
         checkpoint.save_policy(file, agent, config, steps=0, evaluation={})
 
     monkeypatch.setattr(Runner, "learn", keep)
-    first = learn(tmp_path / "first", 1)
-    begun = learn(tmp_path / "begun", 1, seed=1, init_from=str(tmp_path / "first"))
-    fresh = learn(tmp_path / "fresh", 1, seed=1)
+    first = learn(tmp_path / "first", 1000)
+    begun = learn(tmp_path / "begun", 1000, seed=1, init_from=str(tmp_path / "first"))
+    fresh = learn(tmp_path / "fresh", 1000, seed=1)
     first, begun, fresh = (checkpoint.read(f).tensors for f in (first, begun, fresh))
     assert all(torch.equal(first[name], begun[name]) for name in first)
     assert not any(torch.equal(v, fresh[k]) for k, v in first.items() if v.ndim > 1)
@@ -108,13 +113,13 @@ def same(draw):
     return draw()
 
 
-def collected(tmp_path, envs, episodes=4):
+def collected(tmp_path, envs, episodes=4, **changes):
     """Return an algorithm that saw some episodes of random actions."""
     torch.manual_seed(0)
     stack = StateStack(1)
     state = stack.reset(envs.reset(seed=0)[0])
-    config = toy_sac(tmp_path)
-    algorithm = SAC(config, state, 2, hindsight=hindsight())
+    config = toy_sac(tmp_path, **changes)
+    algorithm = Judged(config, state, 2)
     for _ in range(episodes * LENGTH):
         action = algorithm.act(state)
         obs, reward, terminated, truncated, info = envs.step(action)
@@ -122,6 +127,31 @@ def collected(tmp_path, envs, episodes=4):
         state = stack.push(obs, truncated)
         algorithm.observe(Outcome(reward, terminated, truncated, state, final))
     return algorithm
+
+
+def test_a_sense_of_ones_own_is_kept_whole(tmp_path, monkeypatch) -> None:
+    height = senses.Term("height", "body", "F")
+    monkeypatch.setattr(senses, "_TERMS", [*senses._TERMS, height])
+
+    class Taller(ToyVectorEnv):
+        def _observe(self):
+            obs = super()._observe()
+            obs["extra"]["height"] = torch.cat([self.joints, -self.joints], dim=1)
+            return obs
+
+    agent = toy_sac(tmp_path).agent
+    agent = dataclasses.replace(agent, senses=("proprioception", "height"))
+    algorithm = collected(tmp_path, Taller(snapshots=True), agent=agent)
+    seen = algorithm._seen(*algorithm._rows())
+    joints = seen["proprioception"][:, 0]
+    torch.testing.assert_close(seen["height"], torch.cat([joints, -joints], dim=1))
+    algorithm.share = 0.5
+    algorithm._imitate()
+
+
+def test_checkpoints_are_rarer_than_episodes(tmp_path) -> None:
+    with pytest.raises(ConfigError, match="checkpoint_interval: got 100, expected at"):
+        learn(tmp_path, 1000, checkpoint_interval=100)
 
 
 def test_the_policy_acts_in_ever_more_of_the_envs(tmp_path) -> None:

@@ -205,6 +205,18 @@ def test_an_evaluation_that_is_interrupted_is_made_on_resuming(
     assert_same(tensors(tmp_path / "whole"), tensors(tmp_path / "parts"))
 
 
+def test_a_run_that_began_with_a_policys_words_keeps_them(tmp_path, monkeypatch):
+    begun = toy_config(tmp_path, init_from="NaoInstruct-v1")
+    agent = dataclasses.replace(
+        begun.agent, language="lexicon", vocabulary=(*VOCABULARY, "grape")
+    )
+    begun = dataclasses.replace(begun, agent=agent)
+    monkeypatch.setattr(training, "stored_config", lambda out: begun)
+    monkeypatch.setattr(training, "run", lambda config, *_: config)
+    given = TrainConfig(env_id="Toy-v1", out=str(tmp_path))
+    assert run(given, resume=True) == begun
+
+
 def test_records_have_no_steps_made_again(tmp_path, interrupt):
     interrupt(4, TrainingDivergedError)  # leaves the checkpoint of the second update
     with pytest.raises(TrainingDivergedError):

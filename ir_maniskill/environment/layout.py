@@ -14,8 +14,9 @@ import numpy as np
 from ir_maniskill.environment.robots.robot import Robot
 from ir_maniskill.environment.table_objects import EMPTY
 from ir_maniskill.experiment import Drawn, Experiment, Spoken
-from ir_maniskill.goals import DIRECTIONS, Push
-from ir_maniskill.language import Allows, Thing
+from ir_maniskill.goals import DIRECTIONS, Goal, Push
+from ir_maniskill.language import Allows, Thing, kind_of
+from ir_maniskill.language.splits import acts_of
 
 CANDIDATES = 40
 """Places that are tried for each object; if none is free it is left out."""
@@ -65,6 +66,10 @@ class Seats:
     def allows(self, things: Sequence[Thing]) -> Allows:
         """Return what says that anything may be asked: the experiment says what."""
         return lambda acts: True
+
+    def has_hands(self, goal: Goal) -> bool:
+        """Return that there are hands for any goal: the experiment says what."""
+        return True
 
 
 class Free:
@@ -122,10 +127,17 @@ class Free:
 
     # -- What can be asked -----------------------------------------------------------
 
+    def has_hands(self, goal: Goal) -> bool:
+        """Return whether the robot has the hands that a goal takes."""
+        if kind_of(goal) == "both":
+            return len(self.hands) == 2
+        verbs = [verb.split() for verb, _ in acts_of(goal)]
+        return {hand for hand, *what in verbs if what == ["hand"]} <= self.hands.keys()
+
     def allows(self, things: Sequence[Thing]) -> Allows:
         """Return whether the robot can do verbs to objects of a scene together.
 
-        In the split `places` one of the objects must lie in the part held out.
+        In the split `places` one of these objects must lie in the part held out.
         """
         new = self.split == "places"
 

@@ -300,7 +300,7 @@ class StateStack:
             obs: The observation after a reset of all envs.
         """
         self._state = flatten(obs)
-        for name in _stacked(self._state):
+        for name in stacked(self._state):
             self._state[name] = self._repeat(self._state[name])
         return dict(self._state)
 
@@ -322,7 +322,7 @@ class StateStack:
             done: As for `push`.
         """
         state = flatten(obs)
-        for name in _stacked(state):
+        for name in stacked(state):
             newest = state[name]
             stack = torch.cat([newest[:, None], self._state[name][:, :-1]], dim=1)
             if done is not None and done.any():
@@ -335,5 +335,6 @@ class StateStack:
         return value[:, None].repeat_interleave(self.frames, dim=1)
 
 
-def _stacked(state: State) -> list[str]:
+def stacked(state: State) -> list[str]:
+    """Return the entries of a state that hold the last S observations [N, S, ...]."""
     return [term.name for term in _TERMS if term.stacked and term.name in state]

@@ -50,7 +50,9 @@ class Speaker:
         self.bodies = experiment.bodies
         self.layout = layout
         self.by_hand = [
-            i for i in handwritten() if kind_of(i.goal) in self.spoken.kinds
+            i
+            for i in handwritten()
+            if kind_of(i.goal) in self.spoken.kinds and layout.has_hands(i.goal)
         ]
 
     def draw(

@@ -15,6 +15,7 @@ from difflib import get_close_matches
 from functools import cache, cached_property, lru_cache
 from importlib import resources
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 
@@ -46,6 +47,7 @@ class Lexicon:
         """Shares of the known words in each mixture that `ids` gave so far."""
         self._ids = {word: index for index, word in enumerate(vocabulary)}
         self._rows: dict[str, int] = {}
+        self._lock = Lock()
         self._content = set(vocabulary) - function_words()
         self._read = lru_cache(10_000)(self._unknown)
 
@@ -64,10 +66,11 @@ class Lexicon:
         shares = self.read(word)
         if len(shares) < 2:
             return next((self._ids[known] for known in shares), UNK)
-        if word not in self._rows:
-            self._rows[word] = len(self.mixtures)
-            row = np.array([shares.get(w, 0) for w in self.vocabulary], np.float32)
-            self.mixtures = np.concatenate([self.mixtures, row[None]])
+        with self._lock:  # threads share it
+            if word not in self._rows:
+                row = np.array([shares.get(w, 0) for w in self.vocabulary], np.float32)
+                self.mixtures = np.concatenate([self.mixtures, row[None]])
+                self._rows[word] = len(self.mixtures) - 1
         return len(self.vocabulary) + self._rows[word]
 
     def _unknown(self, word: str) -> Mapping[str, float]:

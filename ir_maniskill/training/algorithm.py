@@ -11,11 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
+import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
 from ir_maniskill.agent.agent import Agent
 from ir_maniskill.environment.senses import State
+from ir_maniskill.training import distributed
 from ir_maniskill.training.config import TrainConfig
 
 
@@ -54,6 +56,11 @@ class Algorithm(ABC):
     """Share of the training that is done, set by the runner; schedules follow it."""
     learns_while_stepping: ClassVar[bool] = False
     """Whether `update` may come while the envs step, before `observe`."""
+
+    @staticmethod
+    def device() -> torch.device:
+        """Return where states are given to it, and where it learns."""
+        return distributed.device()
 
     @abstractmethod
     def __init__(self, config: TrainConfig, state: State, actions: int) -> None:

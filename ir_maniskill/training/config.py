@@ -90,9 +90,10 @@ class SACConfig:
     """Soft actor-critic with hindsight: episodes are judged under many sentences."""
 
     capacity: int = 200_000
-    """Steps that the replay has room for; the oldest make room."""
+    """Rows that the replay has room for; the oldest make room. An episode has one more
+    than steps."""
     random_steps: int = 3_000
-    """Steps at the start whose actions are random; learning begins after them."""
+    """Rows at the start whose actions are random; learning begins after them."""
     others: int = 8
     """Sentences under which an episode is judged beside its own, at most."""
     batch: int = 256
@@ -212,8 +213,22 @@ class TrainConfig:
         fits = (agent.actor == "squashed", agent.critic == "none") == (sac, sac)
         expected = "'squashed' and 'none' with 'sac', others with 'ppo'"
         require(fits, "actor and critic", (agent.actor, agent.critic), expected)
-        fits = not (sac and "state" in (agent.senses or ()))
-        require(fits, "senses", agent.senses, "no 'state', which tells one sentence's")
+        if sac:
+            self._require_fit_for_sac()
+
+    def _require_fit_for_sac(self) -> None:
+        senses, start = self.agent.senses, self.sac.random_steps
+        fits = "state" not in (senses or ())
+        require(fits, "senses", senses, "no 'state', which tells one sentence's")
+        for name, value in (
+            ("penalty_warmup", self.penalty_warmup),
+            ("posture_gain", self.agent.posture_gain),
+        ):
+            require(value == 0, name, value, "0 with 'sac'")
+        taught = self.total_steps * self.sac.policy_from
+        expected = f"more: the teacher learns from {start} (sac.random_steps) until "
+        expected += f"{taught:.0f} (sac.policy_from)"
+        require(taught > start, "total_steps", self.total_steps, expected)
 
     @property
     def steps_per_env(self) -> int:

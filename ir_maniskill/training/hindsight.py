@@ -244,6 +244,7 @@ class Pursuit:
         self._asked: list[Goal | None] = [None] * envs
         self._goals = GoalBatch(())
         self._fouled = torch.zeros(envs, dtype=torch.bool)
+        self._stage = torch.zeros(envs, dtype=torch.int64)
 
     def forget(self, envs: Iterable[int]) -> None:
         """Learn that new episodes begin in some envs."""
@@ -265,8 +266,11 @@ class Pursuit:
             self._asked = [*asked]
             self._goals = table.deal(torch.arange(self.envs), scene)
         measure = self._goals.measure(scene)
-        verdict = reward_generator.judge(scene, measure)
+        # What was a foul depends on what was asked for when the step began.
+        before = scene.at_stage(self._stage.where(~new, scene.stage))
+        verdict = reward_generator.judge(before, self._goals.measure(before))
         self._fouled = (self._fouled | verdict.foul) & ~new
+        self._stage = scene.stage
         return describe(scene, measure, verdict, self._fouled)
 
 

@@ -170,3 +170,5 @@ class Replay:
         self.written, self.episodes = written, episodes
         # Rows of a later time than the checkpoint's would pass for those to come.
         self._rows[EPISODE][self._rows[EPISODE] >= episodes] = -1
+        if not self._whole(torch.arange(len(self))).any():
+            self.written = 0

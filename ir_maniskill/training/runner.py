@@ -68,7 +68,7 @@ class Runner:
         """
         self.config, self.folder = config, folder
         self.envs, self.eval_envs = envs, eval_envs
-        self.device = distributed.device()
+        self.device = algorithm.device()
         self.stack, self.counts = StateStack(config.frames), StepCounts()
         self.steps, self.saved, self.evaluated = 0, 0, 0
         self.seconds = {"collect": 0.0, "update": 0.0}

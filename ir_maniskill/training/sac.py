@@ -25,7 +25,7 @@ from ir_maniskill.agent.actor import Squashed, SquashedActor
 from ir_maniskill.agent.agent import Agent, StateSpec
 from ir_maniskill.agent.object_vision import LENGTH, ObjectVision
 from ir_maniskill.checks import require
-from ir_maniskill.environment.senses import State, read_text
+from ir_maniskill.environment.senses import State, read_text, stacked
 from ir_maniskill.snapshot import Snapshot
 from ir_maniskill.training import distributed
 from ir_maniskill.training.algorithm import (
@@ -64,8 +64,8 @@ WIDTHS = (384, 384)
 
 def in_16_bits() -> torch.autocast:
     """Return a context that multiplies in 16 bits where that is faster."""
-    fast = torch.cpu._is_avx512_bf16_supported()
-    return torch.autocast("cpu", torch.bfloat16, enabled=fast)
+    known = getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)
+    return torch.autocast("cpu", torch.bfloat16, enabled=known())
 
 
 class Critics(nn.Module):
@@ -112,6 +112,11 @@ class SAC(Algorithm):
 
     learns_while_stepping = True
 
+    @staticmethod
+    def device() -> torch.device:
+        """Return the CPU: the replay is in files, and the networks are small."""
+        return torch.device("cpu")
+
     def __init__(
         self,
         config: TrainConfig,
@@ -130,10 +135,17 @@ class SAC(Algorithm):
         ranks = distributed.size()
         require(ranks == 1, "processes", ranks, "1: SAC trains in a single one")
         self.hindsight = hindsight or Hindsight.of(config, config.sac.others)
+        rows = 2 * config.num_envs * self.hindsight.experiment.episode_steps
+        expected = f"at least {rows}: episodes that a checkpoint cuts short are lost"
+        every = config.checkpoint_interval
+        require(every >= rows, "checkpoint_interval", every, expected)
         self.frames = config.frames
         self._threads = config.threads or distributed.cores()
         self.agent = Agent(config.agent, StateSpec.of(state, actions))
         self.agent.to(state["instruction"].device)
+        stacks = stacked(state)
+        self._sensed = {name: name in stacks for name in self.agent.encoder.sensed}
+        """What the policy senses, and whether it is stacked."""
         read = self.agent.encoder.language.reads
         self._sentence = {name: state[name].shape[1] for name in read}
         self.pursuit = Pursuit(self.hindsight, len(state["instruction"]))
@@ -199,10 +211,10 @@ class SAC(Algorithm):
 
     def _kept(self, state: State) -> State:
         """Return what of a state is kept: of stacks the newest alone."""
-        stacked = {*self.agent.encoder.sensed, "proprioception", "target"}
-        newest = {name: state[name][:, 0] for name in stacked}
-        once = ("joint_velocity", "snapshot", "text")
-        return newest | {name: state[name] for name in once}
+        names = {*self.agent.encoder.sensed, "proprioception", "target"}
+        names |= {"joint_velocity", "snapshot", "text"}
+        stacks = stacked(state)
+        return {k: state[k][:, 0] if k in stacks else state[k] for k in names}
 
     def observe(self, outcome: Outcome) -> None:
         """Judge and keep the episodes that ended."""
@@ -290,8 +302,10 @@ class SAC(Algorithm):
     def _seen(self, rows: Tensor, which: Tensor) -> State:
         """Return states as the policy perceives them, and the truth."""
         replay = self.replay
-        sensed = self.agent.encoder.sensed
-        seen = {name: replay.read(name, rows, frames=self.frames) for name in sensed}
+        seen = {
+            name: replay.read(name, rows, frames=self.frames if stacks else None)
+            for name, stacks in self._sensed.items()
+        }
         seen |= {k: replay.read(k, rows, column=which) for k in self._sentence}
         if "instruction" in seen:
             seen["instruction"] = seen["instruction"].long()

@@ -89,7 +89,11 @@ def train(
         stored = stored_config(Path(config.out)) if resume else None
         if stored is not None:
             experiment = envs.experiment if envs else catalog.get(stored.env_id)
-            config = resumed(stored, for_experiment(config, experiment))
+            senses = config.agent.senses or experiment.senses
+            agent = dataclasses.replace(
+                config.agent, senses=senses, vocabulary=stored.agent.vocabulary
+            )
+            config = resumed(stored, dataclasses.replace(config, agent=agent))
     return run(config, resume, envs, eval_envs, algorithm)
 
 
