@@ -6,12 +6,11 @@ oldest rows make room for the newest. Legend: N rows, S stacked observations.
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Mapping
 from pathlib import Path
 
 import torch
+from numpy.lib.format import open_memmap
 from torch import Tensor
 
 Rows = dict[str, Tensor]
@@ -77,24 +76,18 @@ class Replay:
             return
         layout = {name: (rows.dtype, rows.shape[1:]) for name, rows in like.items()}
         layout |= {name: (torch.int64, torch.Size()) for name in (EPISODE, AGE, LENGTH)}
-        if self._folder is not None:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            shapes = {
-                k: [str(dtype), list(shape)] for k, (dtype, shape) in layout.items()
-            }
-            text = json.dumps({"capacity": self.capacity, "rows": shapes})
-            (self._folder / "layout.json").write_text(text)
         for name, (dtype, shape) in layout.items():
-            self._rows[name] = self._room(name, dtype, shape)
+            rows = torch.zeros(1, dtype=dtype).expand(self.capacity, *shape)
+            self._rows[name] = self._kept(name, rows)
         self._rows[EPISODE].fill_(-1)
 
-    def _room(self, name: str, dtype: torch.dtype, shape: torch.Size) -> Tensor:
-        size = self.capacity * math.prod(shape)
+    def _kept(self, name: str, rows: Tensor) -> Tensor:
+        """Return room for such rows, which are all 0: in memory, or in a new file."""
         if self._folder is None:
-            return torch.zeros(self.capacity, *shape, dtype=dtype)
-        path = str(self._folder / name)
-        mapped = torch.from_file(path, shared=True, size=size, dtype=dtype)
-        return mapped.view(self.capacity, *shape)
+            return rows.clone()
+        self._folder.mkdir(parents=True, exist_ok=True)
+        path, kind = self._folder / f"{name}.npy", rows.numpy().dtype
+        return torch.from_numpy(open_memmap(path, "w+", kind, tuple(rows.shape)))
 
     # -- Reading ---------------------------------------------------------------------
 
@@ -150,23 +143,19 @@ class Replay:
         """Go on with the rows in the folder; without one, with none.
 
         Raises:
-            ValueError: They are not there, or have another layout.
+            ValueError: They are not there, or there is room for more or fewer.
         """
         if self._folder is None:
             return
         written, episodes = tensors["written"].tolist()
         if not written:
             return
-        path = self._folder / "layout.json"
-        if not path.exists():
+        for path in self._folder.glob("*.npy"):
+            self._rows[path.stem] = torch.from_numpy(open_memmap(path, "r+"))
+        if not self._rows:
             raise ValueError(f"replay: got nothing in {self._folder}")
-        layout = json.loads(path.read_text())
-        if layout["capacity"] != self.capacity:
-            got = layout["capacity"]
+        if (got := len(self._rows[EPISODE])) != self.capacity:
             raise ValueError(f"replay: got {got} rows, expected {self.capacity}")
-        for name, (dtype, shape) in layout["rows"].items():
-            kind = getattr(torch, dtype.removeprefix("torch."))
-            self._rows[name] = self._room(name, kind, torch.Size(shape))
         self.written, self.episodes = written, episodes
         # Rows of a later time than the checkpoint's would pass for those to come.
         self._rows[EPISODE][self._rows[EPISODE] >= episodes] = -1
