@@ -211,7 +211,7 @@ def player_of(policy: Policy, frames: int) -> Player:
         state = stack.reset(obs) if done is None else stack.push(obs, done)
         count, device = len(state["instruction"]), state["instruction"].device
         if device.type != "cpu":
-            return policy(state)
+            return policy(state).to(device)
         rows = [{k: v[i : i + 1] for k, v in state.items()} for i in range(count)]
         return torch.cat([policy(row) for row in rows]).to(device)
 
