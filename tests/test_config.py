@@ -58,7 +58,7 @@ def test_a_budget_scales_all_that_follows_the_steps():
             {"reward_weights": vars(RewardWeights()) | {"after_foul": 1.5}},
             "reward_weights.after_foul: got 1.5",
         ),
-        ({"schema": 6}, "schema: got 6, expected 1 to 5"),
+        ({"schema": 4}, "schema: got 4, expected 1 to 3"),
     ],
 )
 def test_wrong_configs_say_what_was_got_and_expected(change, message):

@@ -223,7 +223,7 @@ def test_the_reward_scale_goes_on_after_a_restart():
 
 def judged(log_prob, value=0.0, target=None):
     """Return an agent that judges every action as given."""
-    values = [torch.as_tensor(x, dtype=torch.float) for x in (log_prob, 2.0, value)]
+    values = [torch.as_tensor(x, dtype=torch.float) for x in (log_prob, value)]
     judgement = Judgement(*values, target)
     config = SimpleNamespace(auxiliary_weight=2.0)
     return SimpleNamespace(evaluate_actions=lambda *_: judgement, config=config)
@@ -243,14 +243,13 @@ def test_policy_loss_is_clipped_by_hand():
     assert float(terms["clipped"]) == 1.0
 
 
-def test_value_auxiliary_and_effort_losses_by_hand():
+def test_value_and_auxiliary_losses_by_hand():
     agent = judged([0.0, 0.0], value=[1.0, 3.0], target=torch.full((2, 3), 0.15))
     place = {"named_position": torch.full((2, 3), 0.1)}
-    config = PPOConfig(effort=0.5)
-    loss, terms = ppo.ppo_loss(agent, batch_of([1.0, -1.0], **place), config)
+    loss, terms = ppo.ppo_loss(agent, batch_of([1.0, -1.0], **place), PPOConfig())
     assert float(terms["value"]) == pytest.approx(2.5)
     assert float(terms["auxiliary"]) == pytest.approx(0.25)  # 0.5 dm off, squared
-    assert float(loss) == pytest.approx(0.5 * 2.5 + 2.0 * 0.25 + 0.5 * 4.0)
+    assert float(loss) == pytest.approx(0.5 * 2.5 + 2.0 * 0.25)
 
 
 def test_an_object_that_fell_far_does_not_outweigh_the_others():

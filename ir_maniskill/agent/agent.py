@@ -81,7 +81,6 @@ class Judgement(NamedTuple):
     """How likely past actions are under the present policy."""
 
     log_prob: Tensor  # [N]
-    mean: Tensor  # [N, A], the action without noise
     value: Tensor  # [N]
     named_position: Tensor | None  # [N, 3] [m], where the named object is thought to be
 
@@ -234,7 +233,6 @@ class Agent(nn.Module):
         policy = self._distribution(state, aligned)
         return Judgement(
             policy.log_prob(action).sum(-1),
-            policy.mean,
             self.value(state),
             None if self.locator is None else self.locator(aligned),
         )

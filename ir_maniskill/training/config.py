@@ -19,7 +19,7 @@ AlgorithmName = Literal["ppo", "sac"]
 SimBackend = Literal["physx_cpu", "physx_cuda"]
 RenderBackend = Literal["auto", "cpu"]
 
-SCHEMA = 5
+SCHEMA = 3
 """Version of the form in which configs are written."""
 
 MAY_CHANGE = {
@@ -66,8 +66,6 @@ class PPOConfig:
     """Standard deviation of the action noise at the start."""
     std_final: float = 0.05
     """Standard deviation at the end, approached by the same amount each step."""
-    effort: float = 0.01
-    """Weight of the mean squared action in the loss: what need not move stays."""
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
@@ -79,8 +77,6 @@ class PPOConfig:
         require_fields(self, "gamma gae_lambda", lambda x: 0 <= x <= 1, "0 to 1")
         above, expected = "learning_rate clip std std_final", "more than 0, and finite"
         require_fields(self, above, lambda x: 0 < x < math.inf, expected)
-        expected = "at least 0, and finite"
-        require_fields(self, "effort", lambda x: 0 <= x < math.inf, expected)
         above, expected = "target_kl max_grad_norm", "more than 0, or None"
         require_fields(self, above, lambda x: x is None or x > 0, expected)
 
@@ -116,8 +112,6 @@ class SACConfig:
     """Discount of a step."""
     reward_scale: float = 0.2
     """Factor of rewards, beside which entropy counts."""
-    effort: float = 0.3
-    """Weight of the teacher's mean squared action: what need not move stays."""
     polyak: float = 0.005
     """How far the slow critics follow at each gradient."""
 
@@ -133,8 +127,6 @@ class SACConfig:
         require_fields(self, "policy_from", lambda x: 0 < x < 1, begun)
         above = "learning_rate policy_rate reward_scale"
         require_fields(self, above, lambda x: 0 < x < math.inf, "more than 0")
-        expected = "at least 0, and finite"
-        require_fields(self, "effort", lambda x: 0 <= x < math.inf, expected)
 
 
 @dataclass(frozen=True)
@@ -325,7 +317,6 @@ CONFIGS: dict[str, TrainConfig] = {
             max_grad_norm=None,
             std=0.36,
             std_final=0.36,
-            effort=0.0,
         ),
     ),
 }
@@ -374,15 +365,8 @@ def migrate(data: object) -> object:
         if schema < 3:
             fields["agent"] = {"actor": "gaussian", **fields["agent"]}
     if schema < 3:
-        sac = dataclasses.asdict(SACConfig())
-        fields = {"algorithm": "ppo", "sac": sac, **fields}
-    if schema < 4:
-        fields = {"init_from": None, **fields}
-    if schema < 5:
-        for learner in ("ppo", "sac"):
-            if isinstance(old := fields.get(learner), dict):
-                fields[learner] = {"effort": 0.0, **old}
-                fields[learner].pop("own", None)
+        new = {"algorithm": "ppo", "sac": dataclasses.asdict(SACConfig())}
+        fields = {**new, "init_from": None, **fields}
     return fields
 
 

@@ -240,9 +240,6 @@ def ppo_loss(agent: Agent, batch: Batch, config: PPOConfig) -> Loss:
         off = functional.huber_loss(guess / DECIMETER, truth / DECIMETER)
         terms["auxiliary"] = 2 * off
         loss = loss + agent.config.auxiliary_weight * terms["auxiliary"]
-    if config.effort > 0:
-        terms["effort"] = now.mean.square().mean()
-        loss = loss + config.effort * terms["effort"]
     terms["kl"] = (ratio - 1 - log_ratio).mean()  # low-variance estimate, never < 0
     terms["clipped"] = ((ratio - 1).abs() > config.clip).float().mean()
     return loss, terms

@@ -369,11 +369,9 @@ class SAC(Algorithm):
     def _improve_teacher(self, now: State) -> None:
         """Do what both critics value, as randomly as the target entropy asks."""
         temperature, known = self.log_temperature.detach().exp(), self._known(now)
-        taught = self._taught(known)
-        action, log_prob = taught.rsample()
+        action, log_prob = self._taught(known).rsample()
         value = self.critics(known, action).amin(dim=0)
-        effort = self.config.effort * taught.mean.square().mean(dim=1)
-        self._descend("teacher", (temperature * log_prob - value + effort).mean())
+        self._descend("teacher", (temperature * log_prob - value).mean())
         entropy = linear(*ENTROPY, max(0.0, 1.5 * self._learned - 0.5))
         excess = -entropy * self.actions - log_prob.detach().mean()
         self._descend("temperature", self.log_temperature.exp() * excess)
