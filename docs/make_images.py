@@ -5,8 +5,6 @@ python docs/make_images.py nao NaoTouchCubeMulti-v1  # these
 """
 
 import argparse
-import io
-import json
 import textwrap
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -18,7 +16,6 @@ from typing import Any
 import gymnasium as gym
 import torch
 from mani_skill.utils.sapien_utils import look_at
-from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
 import ir_maniskill  # noqa: F401 - registers the tasks
@@ -71,12 +68,6 @@ SCENE, TOLD = (
     ),
 )
 """Seed of a scene, and what its film tells the policy there, one after the other."""
-RUNS = Path(__file__).parent / "results" / "runs"
-LEARNERS: dict[str, dict[str, Any]] = {
-    "default": {"color": "#2f6fde", "label": "PPO (default)"},
-    "listen": {"color": "#d9822b", "label": "SAC with hindsight (listen)"},
-}
-"""Presets whose curves stand side by side, and how they are drawn."""
 FAILURE = (EVALUATION_SEED + 35, 2)
 """Seed and sentence of an episode in which the shipped policy touches a wrong cube."""
 
@@ -182,30 +173,6 @@ def glimpse(split: str, size: tuple[int, int], seed: int) -> tuple[Image.Image, 
     return view, said
 
 
-def learners() -> Image.Image:
-    """Return curves of both algorithms, over steps and over minutes."""
-    runs = [json.loads(path.read_text()) for path in RUNS.glob("learner-*.json")]
-    tasks = sorted({run["task"] for run in runs}, key=[*LAYOUTS].index)
-    figure = Figure((4 * len(tasks), 5), dpi=110, layout="constrained")
-    grid = figure.subplots(2, len(tasks), sharey=True, squeeze=False)
-    for row, unit in zip(grid, ("steps", "minutes"), strict=True):
-        row[0].set_ylabel("exclusive success [%]")
-        for axes, task in zip(row, tasks, strict=True):
-            axes.set(title=task, xlabel=unit, ylim=(-3, 103))
-            axes.spines[["top", "right"]].set_visible(False)
-            axes.grid(axis="y", color="#e7eaef")
-            for run in (run for run in runs if run["task"] == task):
-                first = {unit: 0.0, "eval/exclusive": 0.0}
-                dots = [first, *run["evaluations"]]
-                x, y = ([dot[k] for dot in dots] for k in (unit, "eval/exclusive"))
-                style = LEARNERS[run["label"]]
-                axes.plot(x, [100 * share for share in y], "o-", markersize=4, **style)
-    lines = {line.get_label(): line for line in grid[0, 0].lines}
-    figure.legend(lines.values(), lines, loc="outside upper center", ncols=2)
-    figure.savefig(picture := io.BytesIO())
-    return Image.open(picture).convert("RGB")
-
-
 def save(make: Callable[[], Image.Image], path: Path) -> None:
     """Write a picture, small."""
     page = make().quantize(256, dither=Image.Dither.FLOYDSTEINBERG)
@@ -260,10 +227,7 @@ def main() -> None:
     """Write what is asked for."""
     pictures = {
         name: partial(save, make)
-        for name, make in (
-            *(("nao", hero), ("tasks", scenes)),
-            *(("instruct", instruct), ("learners", learners)),
-        )
+        for name, make in (("nao", hero), ("tasks", scenes), ("instruct", instruct))
     }
     films = {task: partial(film, task) for task in FILMS}
     films |= {"failure": failure, "training": training}
