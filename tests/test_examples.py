@@ -125,7 +125,7 @@ def test_training_then_evaluating_its_policy(tmp_path: Path) -> None:
 @pytest.mark.render
 @pytest.mark.slow
 def test_a_task_is_learned_from_scratch_or_from_another_policy(tmp_path: Path) -> None:
-    command = ("-c", TINY, script("pretrained.py"), "--steps", "64")
+    command = ("-c", TINY, script("pretrained.py"), "--steps", "128")
     run(tmp_path, *command)
     out = run(tmp_path, *command, "--init-from", "NaoInstruct-v1")
     assert re.search(r"Press the crimson bell\. +1 .*\nGrab the navy tin\. +1 ", out)
