@@ -80,16 +80,17 @@ class Speaker:
         slots = np.empty((len(wishes), self.layout.slots), dtype=np.int64)
         places = np.empty((*slots.shape, 2))
         said: dict[int, Instruction] = {}
+        left = [*range(len(wishes))]  # who has no scene yet
         for tried in range(SCENES):
-            left = [i for i in range(len(wishes)) if i not in said]
-            if not left:
-                return slots, places, [said[i] for i in range(len(wishes))]
             noise = [streams[i].uniform(size=self.layout.noise) for i in left]
             slots[left], places[left] = self.layout.lay_out(np.stack(noise))
             for i in left:
                 there = self._things(slots[i], places[i])
                 if answer := self._answer(wishes[i], there, tried):
                     said[i] = answer
+            left = [i for i in left if i not in said]
+            if not left:
+                return slots, places, [said[i] for i in range(len(wishes))]
         wanted = wishes[left[0]].wanted
         asked = self.spoken if wanted is None else repr(wanted.text)
         raise GoalError(
