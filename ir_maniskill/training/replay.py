@@ -74,11 +74,10 @@ class Replay:
         """Make or map the rows, when the first episode tells what they have."""
         if self._rows:
             return
-        layout = {name: (rows.dtype, rows.shape[1:]) for name, rows in like.items()}
-        layout |= {name: (torch.int64, torch.Size()) for name in (EPISODE, AGE, LENGTH)}
-        for name, (dtype, shape) in layout.items():
-            rows = torch.zeros(1, dtype=dtype).expand(self.capacity, *shape)
-            self._rows[name] = self._kept(name, rows)
+        marks = dict.fromkeys((EPISODE, AGE, LENGTH), torch.zeros(1, dtype=torch.int64))
+        for name, rows in {**like, **marks}.items():
+            empty = rows.new_zeros(1).expand(self.capacity, *rows.shape[1:])
+            self._rows[name] = self._kept(name, empty)
         self._rows[EPISODE].fill_(-1)
 
     def _kept(self, name: str, rows: Tensor) -> Tensor:

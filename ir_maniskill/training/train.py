@@ -89,6 +89,7 @@ def train(
         stored = stored_config(Path(config.out)) if resume else None
         if stored is not None:
             experiment = envs.experiment if envs else catalog.get(stored.env_id)
+            # `run` compares the words with the task's.
             senses = config.agent.senses or experiment.senses
             agent = dataclasses.replace(
                 config.agent, senses=senses, vocabulary=stored.agent.vocabulary
