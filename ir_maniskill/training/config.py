@@ -47,7 +47,7 @@ class PPOConfig:
     minibatch: int | None = 256
     """Steps of each gradient; None: all of them."""
     learning_rate: float = 3e-4
-    """Adam's step size, at the start if there is a `target_kl`."""
+    """Adam's learning rate, at the start if there is a `target_kl`."""
     gamma: float = 0.9
     """Discount of a step."""
     gae_lambda: float = 0.95
@@ -57,9 +57,9 @@ class PPOConfig:
     clip: float = 0.2
     """Largest change of an action's probability ratio that is rewarded."""
     target_kl: float | None = 0.015
-    """How far an epoch should find the policy moved [nat]: Adam's step size shrinks
+    """How far an epoch should find the policy moved [nat]: Adam's learning rate shrinks
     where it is twice as far, and grows where it is half; where it is more than three
-    times as far no epoch follows. None: the step size stays, all epochs are made."""
+    times as far no epoch follows. None: it stays, and all epochs are made."""
     max_grad_norm: float | None = 0.5
     """Longest gradient; None: any."""
     std: float = 1.0
@@ -105,9 +105,9 @@ class SACConfig:
     policy_acts: float = 0.75
     """Share of the envs in which the policy acts at the end, and none at the start."""
     learning_rate: float = 1e-3
-    """Adam's step size of critics and teacher."""
+    """Adam's learning rate of critics and teacher."""
     policy_rate: float = 2e-3
-    """Adam's step size of the policy."""
+    """Adam's learning rate of the policy."""
     gamma: float = 0.95
     """Discount of a step."""
     reward_scale: float = 0.2

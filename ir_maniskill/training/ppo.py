@@ -29,11 +29,11 @@ VALUE_WEIGHT = 0.5
 DECIMETER = 0.1
 """Unit of the auxiliary loss [m]: about the spacing of the objects."""
 RATE_CHANGE = 1.5
-"""Factor by which the step size changes, at most once an epoch."""
+"""Factor by which the learning rate changes, at most once an epoch."""
 TOO_FAR = 10 / 3
 """Of `target_kl`: no further epoch once the policy moved so far."""
 LOWEST_RATE, HIGHEST_RATE = 1e-5, 1e-3
-"""Up to which the step size shrinks and grows."""
+"""Up to which the learning rate shrinks and grows."""
 
 
 class PPO(Algorithm):
@@ -116,7 +116,7 @@ class PPO(Algorithm):
         self.reward_scale.restart()
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the agent, the optimizer's averages, its step size, the scale."""
+        """Return the agent, the optimizer's averages, its learning rate, the scale."""
         rate = self.optimizer.param_groups[0]["lr"]
         return {
             **copied("agent", self.agent.state_dict()),
@@ -180,7 +180,7 @@ def improve(
 def adapt_rate(
     optimizer: torch.optim.Optimizer, kl: float, target: float | None
 ) -> None:
-    """Change the step size if an epoch moved the policy too far, or hardly.
+    """Change the learning rate if an epoch moved the policy too far, or hardly.
 
     One that is beyond a bound from the start stays there rather than jump to it.
     """

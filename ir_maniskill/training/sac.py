@@ -48,12 +48,12 @@ log = logging.getLogger(__name__)
 TEMPERATURE = 0.03
 """Weight of the entropy at the start."""
 TEMPERATURE_RATE = 1e-3
-"""Adam's step size of its logarithm."""
+"""Adam's learning rate of its logarithm."""
 ENTROPY = (0.25, -0.75)
 """Entropy of each number of an action that the temperature aims at, in the first third
 of the teacher's training and at its end [nat]."""
 WARMUP = 0.03
-"""Share of a training in which the step size grows."""
+"""Share of a training in which the learning rate grows."""
 LONGEST = 10.0
 """Longest gradient of a step."""
 LOGGED = 64
@@ -423,7 +423,7 @@ class SAC(Algorithm):
         return max(0.0, (self.share - begun) / (1 - begun))
 
     def _set_rate(self, name: str, rate: float, share: float) -> None:
-        """Let an optimizer's step size grow at first, and shrink in the last third."""
+        """Let a learning rate grow at first, and shrink in the last third."""
         part = min(share / WARMUP + 0.02, 3 * (1 - share) + 0.02, 1.0)
         self._optimizers[name].param_groups[0]["lr"] = rate * part
 
