@@ -109,7 +109,10 @@ def audit(
     """
     require(num_envs >= 2, "num_envs", num_envs, "at least 2")
     if isinstance(policy, Policy | str | Path):
-        policy, experiment, _ = _prepare(policy, task, any_task, episodes, seed, None)
+        robot = env_kwargs.get("robot_uids")
+        policy, experiment, _ = _prepare(
+            policy, task, any_task, episodes, seed, None, robot
+        )
         player = player_of(policy.agent.policy, policy.config.frames)
         kwargs = policy.env_kwargs
     else:
@@ -133,6 +136,7 @@ PICTURES = {"obs_mode": "rgb", "control_mode": "pd_joint_target_delta_pos"}
 def _player(policy: Any) -> Player:
     """Return somebody else's policy as one that is told where episodes begin."""
     act, reset = getattr(policy, "act", policy), getattr(policy, "reset", None)
+    require(callable(act), "policy", policy, "a function, or what has a method `act`")
 
     def player(obs: Any, done: Any) -> Any:
         if reset is not None:

@@ -117,6 +117,10 @@ class Arm:
         upper = _chain(articulation, palm)
         moved = [articulation.joints_map[j].child_link.name for j in robot.joints]
         distal = set(itertools.chain(*chains)) - set(upper)
+        if not distal.intersection(moved):
+            raise ValueError(
+                f"robot {robot.uid!r}: got a {hand} hand without joints, expected some"
+            )
         self.joints = np.array([i for i, name in enumerate(moved) if name in upper])
         self._bends = np.array([i for i, name in enumerate(moved) if name in distal])
         self._low = robot.controller.lower.cpu().numpy().astype(float)
