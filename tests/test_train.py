@@ -414,6 +414,13 @@ def test_what_the_weights_need_comes_with_them_unless_it_is_told(before):
     assert beginning_with(None, preset) is preset
 
 
+def test_a_task_is_named_with_its_module_as_elsewhere(monkeypatch):
+    monkeypatch.setattr(training, "run", lambda config, *_: config)
+    config = train("ir_maniskill.tasks.single:NaoTouchCubeSingle-v1")
+    assert config.env_id == "NaoTouchCubeSingle-v1"
+    assert config.out == "runs/NaoTouchCubeSingle-v1"
+
+
 # -- Refusals --------------------------------------------------------------------------
 
 

@@ -119,7 +119,7 @@ class Arm:
         distal = set(itertools.chain(*chains)) - set(upper)
         if not distal.intersection(moved):
             raise ValueError(
-                f"robot {robot.uid!r}: got a {hand} hand without joints, expected some"
+                f"hand {hand!r} of {robot.uid!r}: got stiff fingers, expected joints"
             )
         self.joints = np.array([i for i, name in enumerate(moved) if name in upper])
         self._bends = np.array([i for i, name in enumerate(moved) if name in distal])

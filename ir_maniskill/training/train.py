@@ -57,7 +57,7 @@ def train(
     Where torchrun started several processes, each trains on its share of the envs.
 
     Args:
-        task: Id of the task, or the whole configuration of the training.
+        task: [MODULE:]ID of the task, or the whole configuration of the training.
         resume: Go on from the folder's last checkpoint, if there is one, with the
             folder's own config; of what is given only `MAY_CHANGE` may differ from it.
         envs: Vector of this rank's envs to use (and leave open) instead of making one.
@@ -80,6 +80,8 @@ def train(
     """
     if isinstance(task, str):
         require(preset in CONFIGS, "preset", preset, f"one of {', '.join(CONFIGS)}")
+        if envs is None:
+            task = catalog.get(task).id  # without its module
         changes = {"env_id": task, "out": f"runs/{task}", **changes}
         stored = stored_config(Path(changes["out"])) if resume else None
         usual = stored or beginning_with(changes.get("init_from"), CONFIGS[preset])
