@@ -14,7 +14,7 @@ import torch
 from ir_maniskill import experiment as catalog
 from ir_maniskill.agent.agent import Agent
 from ir_maniskill.agent.language_system import encoder_of
-from ir_maniskill.checks import ConfigError, require
+from ir_maniskill.checks import ConfigError, require, require_choice
 from ir_maniskill.environment.vector import VectorEnv, make_vec
 from ir_maniskill.experiment import Experiment
 from ir_maniskill.policy import load_policy
@@ -79,7 +79,9 @@ def train(
         WorkerError: If a simulator process died or hangs.
     """
     if isinstance(task, str):
-        require(preset in CONFIGS, "preset", preset, f"one of {', '.join(CONFIGS)}")
+        require_choice("preset", preset, CONFIGS)
+        for name in changes:
+            require_choice("argument of train", name, vars(CONFIGS[preset]))
         if envs is None:
             task = catalog.get(task).id  # without its module
         changes = {"env_id": task, "out": f"runs/{task}", **changes}
