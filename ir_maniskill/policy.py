@@ -129,7 +129,7 @@ class Policy:
         reads_any = "instruction" not in encoder_of(self.config.agent).reads
         if self.vocabulary != experiment.vocabulary and not reads_any:
             pairs["vocabulary"] = self.vocabulary, experiment.vocabulary
-        uid = getattr(robot, "uid", robot)
+        uid: Any = getattr(robot, "uid", robot)
         if uid is not None and short_name(uid) != short_name(self.config.robot):
             pairs["robot"] = self.config.robot, uid
         if not any_task and self.env_id != experiment.id:

@@ -425,9 +425,7 @@ def test_a_task_is_named_with_its_module_as_elsewhere(monkeypatch):
 
 
 def test_a_number_that_there_is_not_is_refused_by_what_there_is():
-    with pytest.raises(
-        ConfigError, match="got 'gamma', available: env_id, .* ppo,"
-    ):
+    with pytest.raises(ConfigError, match="got 'gamma', available: env_id, .* ppo,"):
         train("NaoTouchCubeSingle-v1", gamma=0.9)
     with pytest.raises(ConfigError, match="preset: got 'fast', available: default, "):
         train("NaoTouchCubeSingle-v1", preset="fast")
