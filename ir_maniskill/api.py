@@ -27,7 +27,6 @@ from ir_maniskill.evaluation.evaluate import (
 from ir_maniskill.experiment import Experiment
 from ir_maniskill.files import require_writable
 from ir_maniskill.policy import Policy, load_policy
-from ir_maniskill.training.checkpoint import MismatchError
 
 PolicyLike = Policy | str | Path
 """A policy, the file of one, or the id of a task whose policy ships."""
@@ -202,12 +201,7 @@ def _prepare(
     if not isinstance(policy, Policy):
         policy = load_policy(policy)
     experiment = catalog.get(task or policy.env_id)
-    try:
-        policy.require_match(experiment, robot, any_task=any_task)
-    except MismatchError as error:
-        other = experiment.id != policy.env_id and not any_task
-        hint = "; name its task, or say any_task (--any-task) to try it here" * other
-        raise MismatchError(f"{error}{hint}") from error
+    policy.require_match(experiment, robot, any_task=any_task)
     wanted = None if instruction is None else [instruction]
     choose_instructions(experiment, wanted)
     return policy, experiment, wanted

@@ -138,7 +138,9 @@ class Policy:
             then, now = self.metadata.get("task", {}), task_facts(experiment)
             pairs |= {k: (then[k], now.get(k)) for k in then if then[k] != now.get(k)}
         if pairs:
-            told = (_difference(name, *pair) for name, pair in pairs.items())
+            told = [_difference(name, *pair) for name, pair in pairs.items()]
+            if pairs.keys() == {"task"}:  # else that would not do
+                told.append("name its task, or say any_task (--any-task) to try it")
             raise MismatchError(
                 f"policy trained for {self.env_id} does not fit {experiment.id}: "
                 + "; ".join(told)
