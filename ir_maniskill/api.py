@@ -27,7 +27,6 @@ from ir_maniskill.evaluation.evaluate import (
 from ir_maniskill.experiment import Experiment
 from ir_maniskill.files import require_writable
 from ir_maniskill.policy import Policy, load_policy
-from ir_maniskill.training.checkpoint import MismatchError
 
 PolicyLike = Policy | str | Path
 """A policy, the file of one, or the id of a task whose policy ships."""
@@ -109,7 +108,10 @@ def audit(
     """
     require(num_envs >= 2, "num_envs", num_envs, "at least 2")
     if isinstance(policy, Policy | str | Path):
-        policy, experiment, _ = _prepare(policy, task, any_task, episodes, seed, None)
+        robot = env_kwargs.get("robot_uids")
+        policy, experiment, _ = _prepare(
+            policy, task, any_task, episodes, seed, None, robot
+        )
         player = player_of(policy.agent.policy, policy.config.frames)
         kwargs = policy.env_kwargs
     else:
@@ -133,6 +135,7 @@ PICTURES = {"obs_mode": "rgb", "control_mode": "pd_joint_target_delta_pos"}
 def _player(policy: Any) -> Player:
     """Return somebody else's policy as one that is told where episodes begin."""
     act, reset = getattr(policy, "act", policy), getattr(policy, "reset", None)
+    require(callable(act), "policy", policy, "a function, or what has a method `act`")
 
     def player(obs: Any, done: Any) -> Any:
         if reset is not None:
@@ -198,12 +201,7 @@ def _prepare(
     if not isinstance(policy, Policy):
         policy = load_policy(policy)
     experiment = catalog.get(task or policy.env_id)
-    try:
-        policy.require_match(experiment, robot, any_task=any_task)
-    except MismatchError as error:
-        other = experiment.id != policy.env_id and not any_task
-        hint = "; name its task, or say any_task (--any-task) to try it here" * other
-        raise MismatchError(f"{error}{hint}") from error
+    policy.require_match(experiment, robot, any_task=any_task)
     wanted = None if instruction is None else [instruction]
     choose_instructions(experiment, wanted)
     return policy, experiment, wanted

@@ -74,7 +74,7 @@ try:
     if torch.cuda.is_available():
         report["cuda"] = torch.cuda.get_device_name(0)
 except Exception as error:
-    report["cuda_error"] = f"{type(error).__name__}: {error}"
+    report["cuda"] = f"FAILS: {type(error).__name__}: {error}"
 print("PROBE" + json.dumps(report))
 """
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from textwrap import shorten
@@ -14,7 +14,8 @@ from torch import Tensor
 from ir_maniskill import experiment as catalog
 from ir_maniskill.agent.agent import Agent
 from ir_maniskill.agent.language_system import encoder_of
-from ir_maniskill.environment.robots.robot import short_name
+from ir_maniskill.checks import require
+from ir_maniskill.environment.robots.robot import Robot, short_name
 from ir_maniskill.environment.senses import (
     Observation,
     State,
@@ -90,13 +91,16 @@ class Policy:
         `sentences` are said in place of the envs' own, one for all or N.
 
         Raises:
-            ValueError: The observation lacks something, a sentence is too long, or N
-                is not that of the last observation: `reset()` comes before that.
+            ValueError: The observation lacks something, a sentence is too long, there
+                are neither one nor N, or N is not that of the last observation:
+                `reset()` comes before that.
         """
         state = self._see(obs)
         rows = state["instruction"]
         if sentences is not None:
             said = [sentences] * len(rows) if isinstance(sentences, str) else sentences
+            expected = f"one for all, or {len(rows)}, one for each env"
+            require(len(said) == len(rows), "sentences", said, expected)
             state |= self.read(said)
         return self.agent.policy(state).to(rows.device)
 
@@ -105,14 +109,14 @@ class Policy:
         if "instruction" in self.agent.encoder.language.reads:
             for sentence in sentences:
                 warn_of_unknown(sentence, self.vocabulary)
-        longest = max(len(split_words(sentence)) for sentence in sentences)
+        longest = max(len(split_words(sentence)) or 1 for sentence in sentences)
         tokens = tokens_of(sentences, self.vocabulary, longest)
         return {"instruction": tokens, "text": text_of(sentences)}
 
     def require_match(
         self,
         experiment: Experiment,
-        robot: str | None = None,
+        robot: str | type[Robot] | None = None,
         *,
         any_task: bool = False,
     ) -> None:
@@ -125,15 +129,18 @@ class Policy:
         reads_any = "instruction" not in encoder_of(self.config.agent).reads
         if self.vocabulary != experiment.vocabulary and not reads_any:
             pairs["vocabulary"] = self.vocabulary, experiment.vocabulary
-        if robot is not None and short_name(robot) != short_name(self.config.robot):
-            pairs["robot"] = self.config.robot, robot
+        uid: Any = getattr(robot, "uid", robot)
+        if uid is not None and short_name(uid) != short_name(self.config.robot):
+            pairs["robot"] = self.config.robot, uid
         if not any_task and self.env_id != experiment.id:
             pairs["task"] = self.env_id, experiment.id
         elif not any_task:
             then, now = self.metadata.get("task", {}), task_facts(experiment)
             pairs |= {k: (then[k], now.get(k)) for k in then if then[k] != now.get(k)}
         if pairs:
-            told = (_difference(name, *pair) for name, pair in pairs.items())
+            told = [_difference(name, *pair) for name, pair in pairs.items()]
+            if pairs.keys() == {"task"}:  # else that would not do
+                told.append("name its task, or say any_task (--any-task) to try it")
             raise MismatchError(
                 f"policy trained for {self.env_id} does not fit {experiment.id}: "
                 + "; ".join(told)
@@ -167,6 +174,8 @@ class Policy:
 
     def _see(self, obs: Observation) -> State:
         """Add an observation to the history, and return the state."""
+        expected = "a dict: make the env with the policy's `env_kwargs`"
+        require(isinstance(obs, Mapping), "observation", type(obs).__name__, expected)
         done, self._done, count = self._done, None, len(obs["extra"]["instruction"])
         if self._stack is None:
             self._stack, self._count = StateStack(self.config.frames), count
@@ -201,8 +210,9 @@ def load_policy(
     if not path.exists():
         ids = ", ".join(name for name in catalog.available() if shipped(name).exists())
         raise CheckpointError(
-            f"policy: got {str(id_or_path)!r}, expected an existing file, or a task "
-            f"whose policy ships with the package: {ids}"
+            f"policy: got {str(id_or_path)!r}, expected an existing file, a run's "
+            "folder with a best policy, or a task whose policy ships with the package: "
+            + ids
         )
     agent, config, metadata = load_agent(path)
     chosen = device or ("cuda" if torch.cuda.is_available() else "cpu")

@@ -12,7 +12,7 @@ best=$folder/best.safetensors
 finished=$folder/evaluation.json
 
 if [ -f "$finished" ] && [ -f "$best" ]; then
-    echo "A finished run of $task is in $folder (remove it to train anew)."
+    echo "A finished run is in $folder (remove it to train anew, or another task)."
 else
     echo "Training on $task from camera images (README.md says how long that takes)."
     echo "Ctrl-C is safe: the next 'make demo' goes on from the last checkpoint."

@@ -11,15 +11,13 @@ import dataclasses
 import subprocess
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
+from ir_maniskill import evaluate, load_policy, make_vec
 from ir_maniskill import experiment as catalog
-from ir_maniskill.environment.vector import make_vec
 from ir_maniskill.evaluation.audit import same_scene
 from ir_maniskill.evaluation.evaluate import (
     EVALUATION_SEED,
     EvaluationReport,
-    evaluate_policy,
     player_of,
 )
 from ir_maniskill.files import write_json
@@ -36,27 +34,24 @@ def ship(run: Path, episodes: int, scenes: int) -> EvaluationReport:
         episodes: Episodes for each sentence; in all, where sentences are drawn.
         scenes: Scenes in which to give it every sentence, if there are several.
     """
-    stored = checkpoint.read(run / "best.safetensors")
-    agent, config, facts = checkpoint.load_agent(run / "best.safetensors")
-    task, sentences = config.env_id, len(catalog.get(config.env_id).sentences)
-    spoken = sentences == 0  # there are thousands
-    play: dict[str, Any] = {"frames": config.frames, "progress": True}
-    play["seed"] = EVALUATION_SEED
-    with closing(make_vec(task, 8, **config.env_kwargs(training=False))) as envs:
-        told = episodes * (1 if spoken else sentences)
-        report = evaluate_policy(agent.policy, envs, episodes=told, **play)
-        figures = {**report.as_dict(), "commit": _commit()}
-        if sentences != 1:
-            player = player_of(agent.policy, config.frames)
+    best = run / "best.safetensors"
+    stored, policy = checkpoint.read(best), load_policy(best, device="cpu")
+    task, config = policy.env_id, policy.config
+    sentences = len(catalog.get(task).sentences)  # 0: thousands are spoken
+    report = evaluate(policy, episodes=episodes * max(1, sentences))
+    figures = {**report.as_dict(), "commit": _commit()}
+    if sentences != 1:
+        with closing(make_vec(task, 8, **policy.env_kwargs)) as envs:
+            player = player_of(policy.agent.policy, config.frames)
             same = same_scene(player, envs, scenes=scenes, seed=EVALUATION_SEED)[0]
-            exclusive = same.exclusive.as_dict("exclusive")
-            figures["same_scene"] = {"scenes": scenes, **exclusive}
+        exclusive = same.exclusive.as_dict("exclusive")
+        figures["same_scene"] = {"scenes": scenes, **exclusive}
     # Only now: what shipped before stays until the new figures are there.
     path = FOLDER / f"{task}.safetensors"
     path.parent.mkdir(exist_ok=True)
     metadata = {**stored.metadata, "evaluation": figures}
     checkpoint.write(path, dataclasses.replace(stored, metadata=metadata))
-    origin = {"run": run.resolve().name, "steps": facts["steps"]}
+    origin = {"run": run.resolve().name, "steps": stored.metadata["steps"]}
     origin["training_seed"] = config.seed
     write_json(path.with_suffix(".json"), {**origin, **figures})
     return report

@@ -1,6 +1,7 @@
 """An audit takes away what it says, nothing else, and counts what happens."""
 
 import contextlib
+from types import SimpleNamespace
 from typing import ClassVar
 
 import pytest
@@ -15,6 +16,7 @@ from ir_maniskill.evaluation import plots
 from ir_maniskill.evaluation.audit import AuditReport, Row, at_random, blind, controls
 from ir_maniskill.evaluation.evaluate import Rate
 from ir_maniskill.language.tokens import UNK
+from ir_maniskill.training.checkpoint import MismatchError
 
 TASK = catalog.get("NaoTouchCubeTriangle-v1")
 TOKENS = tokens_of(TASK.sentences, TASK.vocabulary, TASK.max_tokens)
@@ -115,7 +117,7 @@ class Rows(list):
 def test_each_row_plays_the_same_episodes(monkeypatch, multi_vec, caplog):
     rows = Rows()
     monkeypatch.setattr(audits, "play", rows)
-    monkeypatch.setattr(audits, "_scripted", lambda *a: rows(None, None, *a[1:])[0])
+    monkeypatch.setattr(audits, "_scripted", lambda *a: rows(None, *a)[2:])
     keep = contextlib.nullcontext(multi_vec)
     monkeypatch.setattr(audits, "closing", lambda envs: keep)
     task = multi_vec.experiment
@@ -128,6 +130,17 @@ def test_each_row_plays_the_same_episodes(monkeypatch, multi_vec, caplog):
     assert by_name["one of its sentences"].success == Rate(3, 6)
     assert by_name[task.sentences[0]].success == Rate(1, 2)
     assert set(NAMES) <= set(by_name) and "take at least 100" in caplog.text
+
+
+def test_what_is_not_scripted_has_no_row(monkeypatch, multi_vec, caplog):
+    def refuse(_):
+        raise ValueError("goal: got Spin")
+
+    none = SimpleNamespace(base_env=None, close=lambda: None)
+    monkeypatch.setattr(audits, "blind", lambda *_: none)
+    monkeypatch.setattr(audits, "Scripted", refuse)
+    assert audits._scripted(multi_vec, [], []) == []
+    assert "no scripted solution: goal: got Spin" in caplog.text
 
 
 def test_a_report_is_a_table_data_and_a_picture(tmp_path):
@@ -167,6 +180,13 @@ def test_anybodys_function_is_audited_on_what_envs_observe(monkeypatch):
     assert asked["made"]["obs_mode"] == "state"
     with pytest.raises(ValueError, match="num_envs: got 1, expected at least 2"):
         ir_maniskill.audit(Mine(), TASK.id, num_envs=1)
+    with pytest.raises(ValueError, match="policy: got .*, expected a function"):
+        ir_maniskill.audit(audits, TASK.id)
+
+
+def test_a_policy_is_not_audited_on_another_robot():
+    with pytest.raises(MismatchError, match="robot: got 'nao', expected 'g1'"):
+        ir_maniskill.audit(TASK.id, robot_uids="g1")
 
 
 def test_several_sentences_are_true_of_one_spoken_scene():

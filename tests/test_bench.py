@@ -87,13 +87,3 @@ def test_training_is_timed_by_what_it_logs(monkeypatch):
     monkeypatch.setattr(bench, "train", train)
     (row,) = bench.learning(updates=3)
     assert (row.speed, row.speed_beside) == (steps / 8, steps / 4)  # medians
-
-
-def test_command_line_reads_its_options():
-    command = cli.parse(["bench", "--seconds", "2", "--quick", "--json", "b.json"])
-    assert command == cli.Bench(json=Path("b.json"), seconds=2.0, quick=True)
-
-
-def test_command_line_refuses_impossible_durations(capsys):
-    assert cli.run(["bench", "--seconds", "0"]) == 2
-    assert "seconds: got 0" in capsys.readouterr().err

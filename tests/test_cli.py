@@ -122,6 +122,7 @@ def test_an_unknown_instruction_lists_those_there_are(capsys, policy_file):
         (["video", IDS[0], "--out", "/dev/null/film.mp4"], "cannot write /dev/null/f"),
         (["evaluate", IDS[0], "--json", "/dev"], "cannot write /dev: Is a directory"),
         (["bench", "--json", "/dev/null/x"], "cannot write /dev/null/x: "),
+        (["bench", "--seconds", "0"], "seconds: got 0"),
     ],
 )
 def test_values_out_of_range_are_refused(arguments, message, capsys, policy_file):

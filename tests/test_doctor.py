@@ -52,6 +52,12 @@ def test_a_crashing_probe_is_reported_not_suffered(monkeypatch):
     assert "ended with code -6" in diagnosis.render_error
 
 
+def test_a_torch_that_cannot_be_imported_is_told(monkeypatch):
+    broken = doctor._PROBE.replace("import torch", "import torch_of_nobody")
+    monkeypatch.setattr(doctor, "_PROBE", broken)
+    assert doctor.diagnose().facts["CUDA"].startswith("FAILS: ModuleNotFoundError")
+
+
 def test_a_hanging_probe_is_given_up(monkeypatch):
     monkeypatch.setattr(doctor, "_PROBE", "import time; time.sleep(60)")
     monkeypatch.setattr(doctor, "PROBE_TIMEOUT", 0.5)

@@ -9,7 +9,12 @@ import torch
 import ir_maniskill
 from ir_maniskill.evaluation import evaluate
 from ir_maniskill.evaluation.audit import same_scene
-from ir_maniskill.evaluation.evaluate import Rate, evaluate_policy, player_of
+from ir_maniskill.evaluation.evaluate import (
+    EvaluationReport,
+    Rate,
+    evaluate_policy,
+    player_of,
+)
 from ir_maniskill.goals import Instruction
 from ir_maniskill.language import parse
 
@@ -164,6 +169,14 @@ def test_report_is_written_as_json_with_versions_and_machine(tmp_path):
     assert data["seed"] == 0 and data["checkpoint"] == "best.safetensors"
     assert data["versions"]["sapien"].startswith("3.") and data["machine"]["cpus"] >= 1
     assert data["machine"]["platform"] == f"{platform.system()} {platform.machine()}"
+
+
+def test_figures_stand_under_their_titles_however_short_the_names_are():
+    score = scripted(num_envs=4)[0].overall
+    report = EvaluationReport("T-v1", 0, 12, {"hand": score, "push": score}, score)
+    head, *rows = str(report).splitlines()
+    assert len(rows) == 3
+    assert all(row.index(" 12 ") + 2 == head.index("N ") for row in rows)
 
 
 class ObedientEnvs(ScriptedEnvs):

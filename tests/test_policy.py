@@ -7,6 +7,7 @@ import torch
 
 import ir_maniskill
 from ir_maniskill import experiment as catalog
+from ir_maniskill.environment.robots import Nao
 from ir_maniskill.environment.senses import StateStack, read_text
 from ir_maniskill.training.checkpoint import CheckpointError, MismatchError
 
@@ -80,20 +81,34 @@ def test_it_can_be_told_any_sentence(policy, caplog):
     assert caplog.text.count("not in the vocabulary: pink") == 1
     with pytest.raises(ValueError, match="sentence of 6 tokens, expected at most 5"):
         told("Touch the very blue cube.")
+    with pytest.raises(
+        ValueError, match=r"sentences: got \['Stop'\], expected one for"
+    ):
+        told(["Stop"])
+    assert told("").shape == (2, 26)
+
+
+def test_a_flat_observation_is_refused(policy):
+    policy.reset()
+    with pytest.raises(ValueError, match=r"got 'Tensor', expected a dict.*env_kwargs"):
+        policy.act(torch.zeros(1, 78))
 
 
 def test_it_says_what_it_was_trained_for(policy):
     assert policy.env_id == TASK
     assert policy.vocabulary == catalog.VOCABULARY
     assert policy.env_kwargs["sensor_configs"]["width"] == 32
-    policy.require_match(catalog.get(TASK), "nao")
+    for robot in ("nao", Nao):
+        policy.require_match(catalog.get(TASK), robot)
     with pytest.raises(MismatchError, match="expected 'NaoTouchButtonMulti-v1'"):
         policy.require_match(catalog.get("NaoTouchButtonMulti-v1"))
 
 
-def test_what_cannot_be_loaded_says_what_can():
+def test_what_cannot_be_loaded_says_what_can(tmp_path):
     with pytest.raises(CheckpointError, match=r"got 'Nao-v1', .*: .*CubeTriangle-v1"):
         ir_maniskill.load_policy("Nao-v1")
+    with pytest.raises(CheckpointError, match="expected .* a run's folder with a best"):
+        ir_maniskill.load_policy(tmp_path)
 
 
 @pytest.mark.render

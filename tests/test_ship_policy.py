@@ -17,8 +17,8 @@ TASK = {1: "NaoTouchCubeSingle-v1", 3: "NaoTouchCubeShuffled-v1"}
 STATE = toy_state(20)
 
 
-def fake_report(policy, envs, *, episodes, **_):
-    figures = {"episodes": episodes, "acts": policy(STATE).tolist()}
+def fake_report(policy, *, episodes):
+    figures = {"episodes": episodes, "acts": policy.agent.policy(STATE).tolist()}
     return SimpleNamespace(as_dict=lambda: figures)
 
 
@@ -48,7 +48,7 @@ def make_run(folder, task):
 def test_a_shipped_policy_has_its_figures_and_origin(tmp_path, monkeypatch, sentences):
     monkeypatch.setattr(ship_policy, "FOLDER", tmp_path / "policies")
     monkeypatch.setattr(ship_policy, "_commit", lambda: "0" * 40)
-    monkeypatch.setattr(ship_policy, "evaluate_policy", fake_report)
+    monkeypatch.setattr(ship_policy, "evaluate", fake_report)
     monkeypatch.setattr(ship_policy, "same_scene", fake_scenes)
     run = make_run(tmp_path / "run5", TASK[sentences])
     ship_policy.ship(run, episodes=20, scenes=10)

@@ -468,9 +468,10 @@ def test_in_a_browser_it_does_as_told(session, tmp_path):
         visit.start()
         while visit.is_alive():
             live.keep_going(page, until=time.perf_counter() + 0.5)
+        live.keep_going(page, until=time.perf_counter() + 2)
     (seen,) = found  # else the visit failed, and its thread said why
     assert seen["moved"] > 0.02 and seen["lights"] == {"right"}
-    assert seen["dragged"] > 0.02
+    assert seen["dragged"] > 0.02 and session.held is None
     assert "not understood" in seen["nonsense"] and "<i>twice</i>" in seen["nonsense"]
     assert all(
         address.startswith(("data:", "blob:", page.address))
@@ -501,11 +502,7 @@ def visited(page, folder):
         browser.screenshot(folder / "told.png")
         place = session.scene.position[0, 0].numpy()
         x, y = pixel(page, place)
-        browser.mouse("mouseMoved", x, y, buttons=0)
-        browser.mouse("mousePressed", x, y)
-        for step in range(1, 9):
-            browser.mouse("mouseMoved", x - 6 * step, y + 6 * step)
-            time.sleep(0.1)
+        drag(browser, x, y)
         browser.mouse("mouseReleased", x - 48, y + 48)
         wait_for(lambda: session.held is None)
         seen["dragged"] = np.linalg.norm(session.scene.position[0, 0].numpy() - place)
@@ -514,4 +511,15 @@ def visited(page, folder):
         seen["nonsense"] = browser.text()
         browser.screenshot(folder / "nonsense.png")
         seen["asked"] = browser.seen
-    return seen
+        drag(browser, *pixel(page, session.scene.position[0, 0].numpy()))
+        wait_for(lambda: session.held is not None)
+    return seen  # the browser is closed while it holds the object
+
+
+def drag(browser, x, y):
+    """Drag what is drawn at a place, and do not let go of it."""
+    browser.mouse("mouseMoved", x, y, buttons=0)
+    browser.mouse("mousePressed", x, y)
+    for step in range(1, 9):
+        browser.mouse("mouseMoved", x - 6 * step, y + 6 * step)
+        time.sleep(0.1)

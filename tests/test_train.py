@@ -414,7 +414,21 @@ def test_what_the_weights_need_comes_with_them_unless_it_is_told(before):
     assert beginning_with(None, preset) is preset
 
 
+def test_a_task_is_named_with_its_module_as_elsewhere(monkeypatch):
+    monkeypatch.setattr(training, "run", lambda config, *_: config)
+    config = train("ir_maniskill.tasks.single:NaoTouchCubeSingle-v1")
+    assert config.env_id == "NaoTouchCubeSingle-v1"
+    assert config.out == "runs/NaoTouchCubeSingle-v1"
+
+
 # -- Refusals --------------------------------------------------------------------------
+
+
+def test_a_number_that_there_is_not_is_refused_by_what_there_is():
+    with pytest.raises(ConfigError, match="got 'gamma', available: env_id, .* ppo,"):
+        train("NaoTouchCubeSingle-v1", gamma=0.9)
+    with pytest.raises(ConfigError, match="preset: got 'fast', available: default, "):
+        train("NaoTouchCubeSingle-v1", preset="fast")
 
 
 def test_a_folder_with_a_run_is_not_overwritten(tmp_path):

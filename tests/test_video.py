@@ -17,6 +17,7 @@ from ir_maniskill.evaluation.video import (
     draw,
     write_video,
 )
+from ir_maniskill.goals import Instruction, Ref, Touch
 
 
 def snapshot(step=3, right=(), wrong=(), history=((False, False),) * 3):
@@ -220,19 +221,22 @@ def test_a_film_of_no_instruction_is_refused():
 @pytest.mark.render
 def test_the_video_shows_the_evaluated_episode(multi_vec, reflex, env_kwargs):
     env_id, seed = "NaoTouchCubeMulti-v1", 20
+    told = [Instruction("Grab the red one.", Touch(Ref("red")))]
     shots = list(
         video.record(
             reflex,
             env_id,
             episodes=1,
             seed=seed,
-            instructions=[1],
+            instructions=told,
             env_kwargs=env_kwargs,
         )
     )
-    report = evaluate_policy(reflex, multi_vec, episodes=1, seed=seed, instructions=[1])
+    report = evaluate_policy(
+        reflex, multi_vec, episodes=1, seed=seed, instructions=told
+    )
     assert [shot.step for shot in shots] == list(range(33))
-    assert {shot.instruction for shot in shots} == {"Touch the red cube."}
+    assert {shot.instruction for shot in shots} == {told[0].text}
     assert shots[-1].score == pytest.approx(report.overall.mean_return)
     seen = shots[1:]
     assert sum(sum(s.right) for s in seen) == round(32 * report.overall.right_fingers)

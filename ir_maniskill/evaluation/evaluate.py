@@ -143,7 +143,7 @@ class EvaluationReport:
     def __str__(self) -> str:
         rows = [*self.instructions.items(), ("all", self.overall)]
         rows = rows if len(self.instructions) > 1 else rows[:1]
-        width = max(len(name) for name, _ in rows)
+        width = max(len(name) for name in ("instruction", *dict(rows)))
         head = (
             f"{'instruction':<{width}}     N  success [95%]         "
             "exclusive [95%]        holding  fingers right/wrong  return"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -48,7 +48,7 @@ def learning_curve(run: Path, out: Path | None = None) -> Path:
         )
     evaluations = _read(run / "evaluations.csv")
     figure = Figure(figsize=(8.0, 5.6), dpi=150, layout="constrained")
-    shares, returns = _panels(figure, heights=(2, 1))
+    shares, returns = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
     dots: dict[str, Any] = {"marker": "o", "linestyle": "", "markersize": 6}
     for name, label, color in SHARES:
         line = _points(metrics, f"train/{name}", 100)
@@ -67,7 +67,11 @@ def learning_curve(run: Path, out: Path | None = None) -> Path:
         columnspacing=1.1,
     )
     returns.plot(*_points(metrics, "train/return"), color=SHARES[0][2], linewidth=1.8)
-    returns.set_ylabel("Return of an episode")
+    returns.set(ylabel="Return of an episode", xlabel="Environment steps")
+    for axes in (shares, returns):
+        _style(axes, "y")
+        axes.spines[["left", "bottom"]].set_color("#c9ced6")
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g} k")
     return _save(figure, out or run / "learning_curve.png")
 
 
@@ -99,10 +103,8 @@ def bars(report: AuditReport, out: Path) -> Path:
             axes.errorbar(100 * share, at, xerr=error, fmt="none", ecolor=INK, lw=0.9)
     axes.set_yticks(at, [row.name for row in rows], fontsize=8, color=INK)
     axes.set(xlim=(0, 101), xlabel="Episodes, 95% interval of exclusive success [%]")
-    axes.spines[["top", "right", "left"]].set_visible(False)
-    axes.tick_params(colors=INK, length=0)
-    axes.grid(axis="x", color="#e7eaef", linewidth=0.8)
-    axes.set_axisbelow(True)
+    _style(axes, "x")
+    axes.spines["left"].set_visible(False)
     figure.suptitle(f"{report.env_id}, {report.episodes} episodes a row", color=INK)
     figure.legend(
         loc="outside lower center", ncols=2, frameon=False, labelcolor=INK, fontsize=8
@@ -130,18 +132,12 @@ def _points(
     return [row["steps"] for row in rows], [scale * row[column] for row in rows]
 
 
-def _panels(figure: Figure, heights: Sequence[int]) -> list[Axes]:
-    """Return axes over the same steps, one below the other."""
-    panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
-    for axes in panels:
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.spines[["left", "bottom"]].set_color("#c9ced6")
-        axes.tick_params(colors=INK, length=0)
-        axes.grid(axis="y", color="#e7eaef", linewidth=0.8)
-        axes.set_axisbelow(True)
-        axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g} k")
-    panels[-1].set_xlabel("Environment steps")
-    return list(panels)
+def _style(axes: Axes, grid: Literal["x", "y"]) -> None:
+    """Leave of the axes what is needed, with a grid along one of them."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(colors=INK, length=0)
+    axes.grid(axis=grid, color="#e7eaef", linewidth=0.8)
+    axes.set_axisbelow(True)
 
 
 def _save(figure: Figure, path: Path) -> Path:

@@ -117,6 +117,10 @@ class Arm:
         upper = _chain(articulation, palm)
         moved = [articulation.joints_map[j].child_link.name for j in robot.joints]
         distal = set(itertools.chain(*chains)) - set(upper)
+        if not distal.intersection(moved):
+            raise ValueError(
+                f"hand {hand!r} of {robot.uid!r}: got stiff fingers, expected joints"
+            )
         self.joints = np.array([i for i, name in enumerate(moved) if name in upper])
         self._bends = np.array([i for i, name in enumerate(moved) if name in distal])
         self._low = robot.controller.lower.cpu().numpy().astype(float)

@@ -36,6 +36,8 @@ from ir_maniskill.files import replacing
 Box = tuple[int, int, int, int]
 """Left, top, width and height [pixel]."""
 Color = tuple[int, int, int]
+Scene = tuple[dict[str, Any], torch.Tensor]
+"""The simulator's state, and which body is in each slot of the table [1, C]."""
 
 SIZE = (1280, 720)
 """Width and height of a frame [pixel]."""
@@ -148,21 +150,34 @@ def stage(env_id: str, robot: Robot) -> gym.Env:
     return env
 
 
+def scene_of(env: Any) -> Scene:
+    """Return what a stage needs to show an env: all but what is said and judged."""
+    state = env.get_state_dict()
+    del state["task"]
+    return state, env.table.slot
+
+
+def show(stage: Any, scene: Scene) -> np.ndarray:
+    """Show a scene on a stage, and return the picture [H, W, 3] uint8."""
+    state, slot = scene
+    stage.unwrapped.table.put(slice(None), slot)
+    stage.unwrapped.set_state_dict(state)
+    return _picture(stage.render())
+
+
 @torch.no_grad()  # no inference mode: what the env keeps must stay changeable
 def _play(
     policy: Policy, env: gym.Env, obs: Any, stack: StateStack, stage: gym.Env
 ) -> Iterator[Snapshot]:
     """Play the episode that a reset has begun."""
     base: Any = env.unwrapped
-    shown: Any = stage.unwrapped
     state, total = stack.reset(obs), base.experiment.episode_steps
     right = wrong = [False] * len(base.agent.fingers)
     score = 0.0
     history: tuple[tuple[bool, bool], ...] = ()
     for step in range(total + 1):
-        shown.set_state_dict(base.get_state_dict())
         yield Snapshot(
-            view=_picture(stage.render()),
+            view=show(stage, scene_of(base)),
             cameras={
                 name: _picture(obs["sensor_data"][name]["rgb"]) for name in cameras(obs)
             },

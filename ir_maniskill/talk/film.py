@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from torch import Tensor
 
 from ir_maniskill.environment.touch_env import CONTROL_FREQ
 from ir_maniskill.evaluation import video
@@ -30,10 +29,8 @@ class Moment:
     """Id of the task."""
     robot: Any
     """Who played."""
-    state: dict[str, Any]
-    """The simulator's state."""
-    slot: Tensor
-    """Which body is in each slot of the table [1, C]."""
+    scene: video.Scene
+    """Where everything was."""
     shot: video.Snapshot
     """The frame, but for the human view, and of its history this step alone."""
 
@@ -61,11 +58,8 @@ class Film:
             score=session.score.reward,
             history=((session.score.success, any(wrong)),),
         )
-        state = session.env.get_state_dict()
-        del state["task"]  # a film is not judged
-        table, robot = session.env.table, session.env.agent
-        moment = Moment(session.choice.task, robot, state, table.slot, shot)
-        self._moments.append(moment)
+        scene, robot = video.scene_of(session.env), session.env.agent
+        self._moments.append(Moment(session.choice.task, robot, scene, shot))
         del self._moments[: -LONGEST * CONTROL_FREQ]
 
     def write(self, path: Path) -> int:
@@ -98,12 +92,10 @@ class Film:
 def _shots(take: list[Moment], stage: Any) -> Iterator[video.Snapshot]:
     history: tuple[tuple[bool, bool], ...] = ()
     for moment in take:
-        stage.unwrapped.table.put(slice(None), moment.slot)
-        stage.unwrapped.set_state_dict(moment.state)
         history += moment.shot.history
         yield replace(
             moment.shot,
-            view=stage.render().cpu().numpy()[0],
+            view=video.show(stage, moment.scene),
             step=len(history),
             total_steps=len(take),
             history=history,

@@ -68,6 +68,8 @@ class Page:
             drag=lambda *place: self._wish(session.drag, *place),
             drop=lambda: self._wish(session.drop),
         )
+        # Who leaves in the middle of a drag lets go of nothing.
+        self.server.on_client_disconnect(lambda _: self._wish(session.drop))
         self._add_talk()
         self._add_time()
         self._add_choice()

@@ -280,7 +280,8 @@ class Session:
     def drag(self, index: int, x: float, y: float) -> None:
         """Hold an object over a place on the table, in the world [m]; see `drop`.
 
-        Off the table, or where another object is, it stays where it was.
+        Beyond the table's edge it stays at the edge; where another object is, where it
+        was.
         """
         scale, half = self.env.agent.scale, OBJECT_SIZE / 2
         place = [

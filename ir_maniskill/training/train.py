@@ -14,7 +14,7 @@ import torch
 from ir_maniskill import experiment as catalog
 from ir_maniskill.agent.agent import Agent
 from ir_maniskill.agent.language_system import encoder_of
-from ir_maniskill.checks import ConfigError, require
+from ir_maniskill.checks import ConfigError, require, require_choice
 from ir_maniskill.environment.vector import VectorEnv, make_vec
 from ir_maniskill.experiment import Experiment
 from ir_maniskill.policy import load_policy
@@ -57,7 +57,7 @@ def train(
     Where torchrun started several processes, each trains on its share of the envs.
 
     Args:
-        task: Id of the task, or the whole configuration of the training.
+        task: [MODULE:]ID of the task, or the whole configuration of the training.
         resume: Go on from the folder's last checkpoint, if there is one, with the
             folder's own config; of what is given only `MAY_CHANGE` may differ from it.
         envs: Vector of this rank's envs to use (and leave open) instead of making one.
@@ -79,7 +79,11 @@ def train(
         WorkerError: If a simulator process died or hangs.
     """
     if isinstance(task, str):
-        require(preset in CONFIGS, "preset", preset, f"one of {', '.join(CONFIGS)}")
+        require_choice("preset", preset, CONFIGS)
+        for name in changes:
+            require_choice("argument of train", name, vars(CONFIGS[preset]))
+        if envs is None:
+            task = catalog.get(task).id  # without its module
         changes = {"env_id": task, "out": f"runs/{task}", **changes}
         stored = stored_config(Path(changes["out"])) if resume else None
         usual = stored or beginning_with(changes.get("init_from"), CONFIGS[preset])
