@@ -320,11 +320,31 @@ def test_drawn_objects_need_spoken_sentences() -> None:
         Spoken(("sing",))
 
 
+CUBES = catalog.get("NaoTouchCubeTriangle-v1").objects
+
+
 def test_the_language_can_be_spoken_over_objects_that_lie_fixed() -> None:
-    cubes = catalog.get("NaoTouchCubeTriangle-v1").objects
-    task = Experiment("Mine-v1", cubes, Spoken(("touch", "where")))
+    task = Experiment("Mine-v1", CUBES, Spoken(("touch", "where")))
     for slot, _, said in drawn(task, "train", 20):
         assert slot.tolist() == [0, 1, 2] and kind_of(said.goal) in ("touch", "where")
+    one = Speaker(
+        task := Experiment("Mine-v1", CUBES, Spoken()), layout_of(task, Panda)
+    )
+    *_, said = one.draw([np.random.RandomState(seed) for seed in range(40)])
+    assert not any("hand" in verb for i in said for verb, _ in acts_of(i.goal))
+
+
+def test_sentences_written_by_hand_are_said_where_they_can_be_true(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    few = Experiment("Mine-v1", Drawn(colors=("red", "blue")), Spoken())
+    texts = {i.text for i in handwritten()}
+    said = [i for *_, i in drawn(few, "wording", 40)]
+    assert 10 < sum(i.text in texts for i in said) < 30
+    assert {ref.color for i in said for ref in i.goal.refs} <= {"red", "blue", None}
+    # "Touch the only cube there is." is never true of three cubes.
+    monkeypatch.setattr("ir_maniskill.environment.speaker.SCENES", 40)
+    assert len(drawn(Experiment("Mine-v1", CUBES, Spoken()), "wording", 40)) == 40
 
 
 # -- Vectors, senses and splits of all ids ---------------------------------------------
