@@ -110,9 +110,12 @@ class Drawn:
 
     def __post_init__(self) -> None:
         for name, known in (("colors", COLORS), ("shapes", SHAPES)):
-            _require_tuple(f"drawn {name}", getattr(self, name), str)
-            for value in getattr(self, name):
-                _require_choice(f"drawn {name}", value, known)
+            values, what = getattr(self, name), f"drawn {name}"
+            _require_tuple(what, values, str)
+            for value in values:
+                _require_choice(what, value, known)
+            distinct = 0 < len(values) == len(set(values))
+            _require(distinct, what, values, "at least one and no two alike")
         _require_tuple("drawn count", self.count, Integral)
         most = len(self.pool)
         valid = len(self.count) == 2 and 1 <= self.count[0] <= self.count[1] <= most
@@ -137,10 +140,13 @@ class Drawn:
 
     def _require_on_table(self, name: str) -> None:
         area, margin = getattr(self, name), OBJECT_SIZE / math.sqrt(2)
-        inside = all(
-            low + margin <= first <= last <= high - margin
-            for (first, last), (low, high) in zip(area, TABLE, strict=True)
-        )
+        try:
+            inside = all(
+                low + margin <= first <= last <= high - margin
+                for (first, last), (low, high) in zip(area, TABLE, strict=True)
+            )
+        except (TypeError, ValueError):  # not two pairs of numbers
+            inside = False
         expected = f"bounds (low, high) of x and y, {margin:.3f} m within {TABLE}"
         _require(inside, f"drawn {name}", area, expected)
 

@@ -303,6 +303,7 @@ def test_a_split_that_there_is_not_is_refused() -> None:
         ({"count": (3, 2)}, "drawn count"),
         ({"count": (2, 12)}, "drawn count: got .* at most . objects in this area"),
         ({"colors": ("pink",)}, "drawn colors: got 'pink'"),
+        ({"shapes": ("can", "can")}, "drawn shapes: got .*no two alike"),
         ({"apart": 0.01}, "drawn apart: got 0.01"),
         ({"area": ((0.0, 0.2), (-0.1, 0.1))}, "drawn area: got"),
     ],

@@ -84,8 +84,9 @@ class RenderedEnv(BaseEnv):
         return {name: _fetch_color(sensor) for name, sensor in sensors}
 
     def get_sensor_params(self) -> dict:
-        """Return the cameras' matrices, computed once: no camera ever moves."""
-        if self._sensor_params is None:
+        """Return the cameras' matrices, computed once if no camera moves."""
+        moving = any(sensor.camera.mount for sensor in self._sensors.values())
+        if self._sensor_params is None or moving:
             self._sensor_params = super().get_sensor_params()
         return self._sensor_params
 
