@@ -33,7 +33,12 @@ from ir_maniskill.environment.layout import layout_of
 from ir_maniskill.environment.rendering import RenderedEnv
 from ir_maniskill.environment.reward_generator import RewardWeights
 from ir_maniskill.environment.robots import Nao
-from ir_maniskill.environment.robots.robot import Robot, available_robots, find_robot
+from ir_maniskill.environment.robots.robot import (
+    Robot,
+    available_robots,
+    find_robot,
+    robot_class,
+)
 from ir_maniskill.environment.speaker import Speaker
 from ir_maniskill.environment.table_objects import TableObjects
 from ir_maniskill.experiment import Experiment, ExperimentError, Spoken
@@ -136,8 +141,7 @@ class TouchEnv(RenderedEnv):
 
     @property
     def _default_sim_config(self) -> SimConfig:
-        uid = self.robot_uids
-        robot = available_robots()[uid] if isinstance(uid, str) else uid
+        robot = robot_class(self.robot_uids)
         cheap = SceneConfig(
             contact_offset=CONTACT_OFFSET * robot.scale,
             solver_position_iterations=robot.solver_iterations,

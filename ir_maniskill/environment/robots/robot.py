@@ -335,6 +335,12 @@ def find_robot(robot: str | type[BaseAgent]) -> str | type[Robot]:
     )
 
 
+def robot_class(robot: str | type[BaseAgent]) -> type[Robot]:
+    """Return the class of a robot; arguments and errors are those of `find_robot`."""
+    found = find_robot(robot)
+    return available_robots()[found] if isinstance(found, str) else found
+
+
 OURS = "ir_"
 """Start of a uid that would else clash with one of ManiSkill's, such as "panda"."""
 
