@@ -22,6 +22,7 @@ import torch
 
 from ir_maniskill import checks
 from ir_maniskill.goals import COLORS, SHAPES, GoalError, Instruction, Ref, Touch
+from ir_maniskill.language import Thing
 from ir_maniskill.language import words as words_of_language
 from ir_maniskill.language.splits import KINDS, SPLITS
 from ir_maniskill.language.tokens import (
@@ -340,7 +341,7 @@ class Experiment:
 
     def _check_refs(self, instruction: Instruction) -> None:
         """Raise unless each reference fits one object, as far as the layout says."""
-        layout = scene_of(self.bodies)
+        layout = scene_of(Thing(o.color, o.shape, *o.position) for o in self.bodies)
         for ref in instruction.goal.refs:
             fits = int(ref.resolve(layout).sum())
             unknown = self.shuffled and ref.where is not None  # told at each reset
@@ -379,10 +380,10 @@ def touch_instructions(objects: Iterable[TouchObject]) -> tuple[Instruction, ...
     )
 
 
-def scene_of(objects: Iterable[TouchObject]) -> Snapshot:
+def scene_of(objects: Iterable[Thing]) -> Snapshot:
     """Return a snapshot that knows only what lies where [1, ...]."""
     things = tuple(objects)
-    poses = torch.tensor([[*o.position, 0, 1, 0, 0, 0] for o in things]).float()[None]
+    poses = torch.tensor([[o.x, o.y, 0, 1, 0, 0, 0] for o in things]).float()[None]
     none = torch.zeros(1, 0, len(things))
     return Snapshot(
         contact=none.bool(),

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ir_maniskill.environment.layout import Free, Seats, hands_of
-from ir_maniskill.experiment import Experiment, Spoken, TouchObject, scene_of
+from ir_maniskill.experiment import Experiment, Spoken, scene_of
 from ir_maniskill.goals import Goal, GoalError, Instruction, Ref
 from ir_maniskill.language import Thing, draw, handwritten, kind_of, say
 from ir_maniskill.language.splits import acts_of, refs_of, status
@@ -178,8 +178,7 @@ def _rng(stream: np.random.RandomState) -> Random:
 
 def resolve(ref: Ref, scene: Sequence[Thing]) -> int | None:
     """Return which object of a scene a reference fits; None: none, or several."""
-    objects = [TouchObject(color, (x, y), shape) for color, shape, x, y in scene]
-    fits = ref.resolve(scene_of(objects))[0].nonzero().flatten().tolist()
+    fits = ref.resolve(scene_of(scene))[0].nonzero().flatten().tolist()
     return fits[0] if len(fits) == 1 else None
 
 

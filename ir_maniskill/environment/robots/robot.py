@@ -22,7 +22,7 @@ from mani_skill.agents.registration import REGISTERED_AGENTS
 from mani_skill.utils.structs import Actor
 from torch import Tensor
 
-from ir_maniskill.environment.bodies import positions
+from ir_maniskill.environment.bodies import poses
 from ir_maniskill.environment.contacts import CpuTouchSensor, GpuTouchSensor
 from ir_maniskill.environment.robots.controller import TargetControllerConfig
 from ir_maniskill.environment.robots.loader import read_builder
@@ -297,7 +297,7 @@ class Robot(BaseAgent, ABC):
 
     def finger_position(self) -> Tensor:
         """Return where the fingertips' links are [N, F, 3] [m]."""
-        return positions(self.fingertip_links)
+        return poses(self.fingertip_links)[..., :3]
 
     def _ordered(self, joints: Tensor) -> Tensor:
         """Reorder [N, J] from the simulator's order to the action's."""
