@@ -185,6 +185,7 @@ def test_pictures_that_a_shader_pack_cannot_draw_are_refused() -> None:
         ({"reward_weights": {"held": 1}}, "got {'held': 1}, expected .*hold, approach"),
         ({"reward_weights": 3}, "reward_weights: got 3, expected a dict of some"),
         ({"observe": 3}, "observe: got 3, available"),
+        ({"obs_mode": "rgb"}, "obs_mode: got 'rgb' with the render_backend 'none', ex"),
     ],
 )
 def test_arguments_that_cannot_work_are_refused(wrong: dict, message: str) -> None:

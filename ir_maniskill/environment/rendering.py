@@ -56,6 +56,11 @@ class RenderedEnv(BaseEnv):
     ) -> dict:
         """Observe; within a step pictures come last, in `_flatten_raw_obs`."""
         if not self._drawing:
+            if not self.scene.can_render():
+                raise ValueError(
+                    f"obs_mode: got {self.obs_mode!r} with the render_backend 'none', "
+                    "expected one without pictures (state, state_dict, none)"
+                )
             return super()._get_obs_with_sensor_data(info, apply_texture_transforms)
         return {
             "agent": self._get_obs_agent(),
