@@ -4,7 +4,6 @@ import dataclasses
 import pickle
 import re
 
-import gymnasium as gym
 import pytest
 import torch
 from hypothesis import given
@@ -43,11 +42,6 @@ def make(**changes: object) -> Experiment:
     """Return a sound experiment with some fields changed."""
     sound = Experiment("Sound-v1", (BLUE, RED), touch_instructions((BLUE, RED)))
     return dataclasses.replace(sound, **changes)
-
-
-def test_import_registers_the_eight_tasks() -> None:
-    assert set(IDS) <= set(ir_maniskill.available())
-    assert all(task_id in gym.registry for task_id in IDS)
 
 
 def test_the_papers_experiments_are_as_the_paper_says() -> None:
