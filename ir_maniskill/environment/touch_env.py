@@ -254,32 +254,29 @@ class TouchEnv(RenderedEnv):
         """Return the active sentence i_t of each env (N strings)."""
         return [instruction.text for instruction in self.instructions]
 
-    def tell(self, said: Any, env_idx: Tensor | None = None) -> None:
+    def tell(self, said: Any) -> None:
         """Give other instructions without a reset.
 
         What they ask for counts from here on: pushes from where things are now, and
         what was reached or fouled before is forgotten.
 
         Args:
-            said: A sentence, an `Instruction` or an index of the task's own, for all of
-                these envs or a list of one for each.
-            env_idx: Which envs; None: all.
+            said: A sentence, an `Instruction` or an index of the task's own, for all
+                envs or a list of one for each.
 
         Raises:
             ValueError: A sentence means nothing that the task or the language knows.
             GoalError: It does not fit the scene, or is too long; nothing has changed.
         """
-        if env_idx is None:
-            env_idx = torch.arange(self.num_envs, device=self.device)
-        told = instructions_of(said, self.experiment, len(env_idx))
-        known, index = self._told(env_idx, told)
-        start = self._start.clone()
-        start[env_idx] = self.table.poses()[env_idx]
+        everyone = torch.arange(self.num_envs, device=self.device)
+        told = instructions_of(said, self.experiment, self.num_envs)
+        known, index = self._told(everyone, told)
+        start = self.table.poses()
         scene = replace(self.snapshot(), start=start / self._size)
         self._goals = known.goals.deal(index, scene)  # what fits no object ends here
         self.instructional_set, self.instruction_index = known, index
         self._start = start
-        self._begin(env_idx)
+        self._begin(everyone)
 
     def _told(
         self, env_idx: Tensor, said: Sequence[Instruction]
