@@ -147,11 +147,6 @@ class ProcessVectorEnv(VectorEnv):
             WorkerError: A worker failed (another reset may do), died or hangs.
         """
         options = {} if options is None else options
-        if isinstance(options, dict) and "env_idx" in options:
-            raise ValueError(
-                "reset options: got 'env_idx', expected none: worker processes reset "
-                "all envs at once, and each by itself when its episode ends"
-            )
         if seed is None and not self._seeded:
             seed = FIRST_SEED
         count = self.num_envs

@@ -110,9 +110,9 @@ class Robot(BaseAgent, ABC):
         Raises:
             ExperimentError: An object may lie too far from every shoulder.
         """
-        slack = experiment.jitter.position * math.sqrt(2)
         if isinstance(experiment.objects, Drawn):
             return  # what is drawn is drawn within reach
+        slack = experiment.jitter.position * math.sqrt(2)
         for thing in experiment.objects:
             place = [cls.scale * value for value in thing.position]
             far = min(math.dist(place, shoulder) for shoulder in cls.shoulders)
