@@ -21,7 +21,7 @@ from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.robots.nao import JOINTS, Nao
 from ir_maniskill.environment.touch_env import CONTACT_OFFSET, TouchEnv
 from ir_maniskill.experiment import Jitter
-from ir_maniskill.goals import Ref, Touch
+from ir_maniskill.goals import Instruction, Ref, Touch
 
 IDS = ir_maniskill.available()[:8]
 QUICK = ("NaoTouchButtonMulti-v1", "NaoTouchCubeShuffled-v1")
@@ -364,6 +364,17 @@ def test_asking_again_changes_nothing_and_a_state_has_no_touches(
     *_, again = hold(fixed, **PRESS)
     assert again["wrong_once"].item()
     assert base.get_info()["wrong_fingers"] == again["wrong_fingers"]
+
+
+def test_what_was_told_in_an_earlier_episode_is_not_restored(fixed: gym.Env) -> None:
+    base = fixed.unwrapped
+    own = Instruction("Go to it.", Touch(Ref("red")))  # of no language
+    fixed.reset(seed=0, options={"instruction": own})
+    fixed.reset()
+    state, said = base.get_state_dict(), base.get_language_instruction()
+    fixed.reset(seed=1)  # in a scene built anew, where nothing has been told
+    base.set_state_dict(state)
+    assert base.get_language_instruction() == said
 
 
 def test_a_touch_between_two_steps_counts(fixed: gym.Env) -> None:

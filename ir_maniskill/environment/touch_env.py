@@ -489,8 +489,8 @@ class TouchEnv(RenderedEnv):
         task = self._task_state()
         for name, value in given.items():
             task[name][rows] = value.to(task[name])
-        self._restore_told(task["told"].byte())
         self.instruction_index = task["instruction_index"][:, 0].long()
+        self._restore_told(task["told"].byte())
         self.table.put(slice(None), task["slot"].long())
         self._stage = task["stage"][:, 0].long()
         self._success_once = task["success_once"][:, 0].bool()
@@ -499,9 +499,11 @@ class TouchEnv(RenderedEnv):
         self._resolve_goals()
 
     def _restore_told(self, text: Tensor) -> None:
-        """Tell envs the sentences [N, B] that they had been told."""
+        """Tell envs the sentences [N, B] that they had been told, if they count."""
         if not torch.equal(text, self.instructional_set.text[-self.num_envs :]):
-            said = {e: s for e, s in enumerate(senses.read_text(text)) if s}
+            counts = (self.instruction_index >= len(self.instructional_set)).tolist()
+            texts = zip(counts, senses.read_text(text), strict=True)
+            said = {env: s for env, (c, s) in enumerate(texts) if c and s}
             told = instructions_of(list(said.values()), self.experiment, len(said))
             told_then = dict(zip(said, told, strict=True))
             self.instructional_set = self.instructional_set.told(told_then)
