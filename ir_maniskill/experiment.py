@@ -22,6 +22,7 @@ import torch
 
 from ir_maniskill import checks
 from ir_maniskill.goals import COLORS, SHAPES, GoalError, Instruction, Ref, Touch
+from ir_maniskill.language import Thing
 from ir_maniskill.language import words as words_of_language
 from ir_maniskill.language.splits import KINDS, SPLITS
 from ir_maniskill.language.tokens import (
@@ -110,9 +111,12 @@ class Drawn:
 
     def __post_init__(self) -> None:
         for name, known in (("colors", COLORS), ("shapes", SHAPES)):
-            _require_tuple(f"drawn {name}", getattr(self, name), str)
-            for value in getattr(self, name):
-                _require_choice(f"drawn {name}", value, known)
+            values, what = getattr(self, name), f"drawn {name}"
+            _require_tuple(what, values, str)
+            for value in values:
+                _require_choice(what, value, known)
+            distinct = 0 < len(values) == len(set(values))
+            _require(distinct, what, values, "at least one and no two alike")
         _require_tuple("drawn count", self.count, Integral)
         most = len(self.pool)
         valid = len(self.count) == 2 and 1 <= self.count[0] <= self.count[1] <= most
@@ -137,10 +141,13 @@ class Drawn:
 
     def _require_on_table(self, name: str) -> None:
         area, margin = getattr(self, name), OBJECT_SIZE / math.sqrt(2)
-        inside = all(
-            low + margin <= first <= last <= high - margin
-            for (first, last), (low, high) in zip(area, TABLE, strict=True)
-        )
+        try:
+            inside = all(
+                low + margin <= first <= last <= high - margin
+                for (first, last), (low, high) in zip(area, TABLE, strict=True)
+            )
+        except (TypeError, ValueError):  # not two pairs of numbers
+            inside = False
         expected = f"bounds (low, high) of x and y, {margin:.3f} m within {TABLE}"
         _require(inside, f"drawn {name}", area, expected)
 
@@ -334,7 +341,7 @@ class Experiment:
 
     def _check_refs(self, instruction: Instruction) -> None:
         """Raise unless each reference fits one object, as far as the layout says."""
-        layout = scene_of(self.bodies)
+        layout = scene_of(Thing(o.color, o.shape, *o.position) for o in self.bodies)
         for ref in instruction.goal.refs:
             fits = int(ref.resolve(layout).sum())
             unknown = self.shuffled and ref.where is not None  # told at each reset
@@ -373,10 +380,10 @@ def touch_instructions(objects: Iterable[TouchObject]) -> tuple[Instruction, ...
     )
 
 
-def scene_of(objects: Iterable[TouchObject]) -> Snapshot:
+def scene_of(objects: Iterable[Thing]) -> Snapshot:
     """Return a snapshot that knows only what lies where [1, ...]."""
     things = tuple(objects)
-    poses = torch.tensor([[*o.position, 0, 1, 0, 0, 0] for o in things]).float()[None]
+    poses = torch.tensor([[o.x, o.y, 0, 1, 0, 0, 0] for o in things]).float()[None]
     none = torch.zeros(1, 0, len(things))
     return Snapshot(
         contact=none.bool(),

@@ -89,7 +89,7 @@ class Relation:
     kind: str
     """One of `RELATIONS`."""
     ref: Ref
-    """The other object."""
+    """The other object; nothing is left or right of none, or of several."""
 
     def __post_init__(self) -> None:
         _require_choice("relation", self.kind, RELATIONS)
@@ -102,7 +102,8 @@ class Relation:
             return ~other
         y = scene.start[..., 1]  # [N, C]
         at = (y * other).sum(dim=1, keepdim=True)
-        return y > at if self.kind == "left_of" else y < at
+        beyond = y > at if self.kind == "left_of" else y < at
+        return beyond & (other.sum(dim=1, keepdim=True) == 1)
 
 
 left_of = partial(Relation, "left_of")

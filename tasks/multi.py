@@ -1,22 +1,16 @@
-"""Experiment II: three objects in a line, three instructions (paper, Sec. IV-B)."""
+"""Experiment II: the same three objects, three instructions (paper, Sec. IV-B)."""
+
+from dataclasses import replace
 
 from ir_maniskill.experiment import Experiment, touch_instructions
-from ir_maniskill.language.tokens import VOCABULARY
 from ir_maniskill.registration import register
-from ir_maniskill.tasks.layouts import line
+from ir_maniskill.tasks.single import single
 
 
 def multi(task_id: str, shape: str) -> Experiment:
     """Return the multi-instruction experiment with objects of the given shape."""
-    objects = line(shape)
-    return Experiment(
-        id=task_id,
-        objects=objects,
-        instructions=touch_instructions(objects),
-        reward="binary",
-        senses=("vision",),
-        vocabulary=VOCABULARY,
-    )
+    one = single(task_id, shape)
+    return replace(one, instructions=touch_instructions(one.bodies))
 
 
 CUBE = register(multi("NaoTouchCubeMulti-v1", "cube"))

@@ -1,14 +1,17 @@
 """Experiment I: three objects in a line, one instruction (paper, Sec. IV-A)."""
 
-from ir_maniskill.experiment import Experiment, touch_instructions
+from ir_maniskill.experiment import Experiment, TouchObject, touch_instructions
 from ir_maniskill.language.tokens import VOCABULARY
 from ir_maniskill.registration import register
-from ir_maniskill.tasks.layouts import line
 
 
 def single(task_id: str, shape: str) -> Experiment:
     """Return the single-instruction experiment with objects of the given shape."""
-    objects = line(shape)
+    objects = (
+        TouchObject("blue", (0.20, 0.0), shape),  # x forward, y left of the torso [m]
+        TouchObject("red", (0.20, 0.10), shape),
+        TouchObject("green", (0.20, -0.10), shape),
+    )
     return Experiment(
         id=task_id,
         objects=objects,

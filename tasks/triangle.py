@@ -1,14 +1,17 @@
 """Experiment III: triangle, proprioception, reward per finger (paper, Sec. IV-C)."""
 
-from ir_maniskill.experiment import Experiment, touch_instructions
+from ir_maniskill.experiment import Experiment, TouchObject, touch_instructions
 from ir_maniskill.language.tokens import VOCABULARY
 from ir_maniskill.registration import register
-from ir_maniskill.tasks import layouts
 
 
 def triangle(task_id: str, shape: str) -> Experiment:
     """Return the improved multi-instruction experiment with objects of that shape."""
-    objects = layouts.triangle(shape)
+    objects = (
+        TouchObject("blue", (0.19, 0.0), shape),  # nearest the chest
+        TouchObject("red", (0.23, 0.08), shape),
+        TouchObject("green", (0.23, -0.08), shape),
+    )
     return Experiment(
         id=task_id,
         objects=objects,

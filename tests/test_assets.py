@@ -1,27 +1,15 @@
 """The NAO model says what its fact tables say; its meshes are those of its script."""
 
-import csv
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 import yourdfpy
 
-from ir_maniskill.assets.nao import SOLE_HEIGHT, URDF_PATH, build
+from ir_maniskill.assets.nao import SOLE_HEIGHT, URDF_PATH, build, facts
 
-FACTS = Path(build.__file__).parent / "facts"
 MESHES = URDF_PATH.parent / "meshes"
-FIXED_POSTURE = {
-    "HeadPitch": 0.15,
-    "LHipPitch": -0.45,
-    "LKneePitch": 0.70,
-    "LAnklePitch": -0.25,
-    "RHipPitch": -0.45,
-    "RKneePitch": 0.70,
-    "RAnklePitch": -0.25,
-}
 ARM = ("ShoulderPitch", "ShoulderRoll", "ElbowYaw", "ElbowRoll", "WristYaw")
 HAND = (
     *("Finger11", "Finger12", "Finger13"),
@@ -33,29 +21,7 @@ JOINTS = tuple(side + name for side in "LR" for name in ARM + HAND)
 
 def read_facts(table: str, key: str) -> dict[str, dict[str, str]]:
     """Return a fact table by the values of one of its columns."""
-    with (FACTS / f"{table}.csv").open(newline="") as file:
-        return {row[key]: row for row in csv.DictReader(file)}
-
-
-def rotation(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Return Rodrigues' rotation [3, 3]."""
-    x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
-
-
-def joint_frame(row: dict[str, str], angle: float) -> np.ndarray:
-    """Return the frame of a joint's child in that of its parent [4, 4]."""
-    roll, pitch, yaw = (float(row[f"{name}_rad"]) for name in ("roll", "pitch", "yaw"))
-    x, y, z = np.eye(3)
-    turn = rotation(z, yaw) @ rotation(y, pitch) @ rotation(x, roll)
-    if row["axis_x"]:
-        axis = np.array([float(row[f"axis_{name}"]) for name in "xyz"])
-        turn = turn @ rotation(axis / np.linalg.norm(axis), angle)
-    frame = np.eye(4)
-    frame[:3, :3] = turn
-    frame[:3, 3] = [float(row[f"origin_{name}_m"]) for name in "xyz"]
-    return frame
+    return {row[key]: row for row in facts.read(table)}
 
 
 def link_frame(link: str, angles: dict[str, float]) -> np.ndarray:
@@ -64,7 +30,7 @@ def link_frame(link: str, angles: dict[str, float]) -> np.ndarray:
     frame = np.eye(4)
     while link != "torso":
         row = parents[link]
-        frame = joint_frame(row, angles.get(row["joint"], 0.0)) @ frame
+        frame = facts.joint_motion(row, angles.get(row["joint"], 0.0)) @ frame
         link = row["parent_link"]
     return frame
 
@@ -142,7 +108,7 @@ def test_the_torso_carries_all_that_never_moves(model, moving_links):
     for name, row in read_facts("links", "link").items():
         mass, com, inertia = body(row)
         if name not in moving_links and mass > 1e-5:
-            frame = link_frame(name, FIXED_POSTURE)
+            frame = link_frame(name, facts.read_posture())
             turn, place = frame[:3, :3], frame[:3, 3]
             bodies.append((mass, turn @ com + place, turn @ inertia @ turn.T))
     total = sum(mass for mass, _, _ in bodies)
@@ -167,7 +133,7 @@ def test_every_inertia_is_that_of_a_real_body(model):
 
 @pytest.mark.parametrize("side", ["l", "r"])
 def test_the_soles_stand_flat_on_the_ground(side):
-    sole = link_frame(f"{side}_sole", FIXED_POSTURE)
+    sole = link_frame(f"{side}_sole", facts.read_posture())
     np.testing.assert_allclose(sole[:3, 2], [0, 0, 1], atol=1e-12)
     assert sole[2, 3] == pytest.approx(SOLE_HEIGHT, abs=1e-6)
 

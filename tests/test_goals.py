@@ -55,7 +55,15 @@ def test_a_reference_means_what_it_meant_when_the_episode_began():
     assert Ref(where="leftmost").resolve(at)[0].tolist() == [False, True, False]
 
 
-@pytest.mark.parametrize("ref", [Ref("yellow"), Ref(shape="cube")])
+@pytest.mark.parametrize(
+    "ref",
+    [
+        Ref("yellow"),
+        Ref(shape="cube"),
+        Ref("red", where=left_of(Ref("yellow"))),  # there is no yellow one
+        Ref("green", where=right_of(Ref(shape="cube"))),  # there are two cubes
+    ],
+)
 def test_a_reference_that_fits_none_or_two_is_refused_where_it_counts(ref):
     with pytest.raises(GoalError, match="got [02] objects that fit in env 0, expected"):
         measured(Touch(ref), scene())

@@ -83,14 +83,6 @@ def test_uniform_numbers_pick_every_instruction_equally() -> None:
     assert picks.tolist() == [0, 0, 1, 1, 2, 2]
 
 
-@given(st.lists(st.floats(0, 1, width=32), min_size=1))
-def test_any_uniform_number_picks_an_instruction(numbers: list[float]) -> None:
-    instructions = InstructionalSet(catalog.get("NaoTouchCubeMulti-v1"), HANDS, CPU)
-    ordered = instructions.pick(torch.tensor(sorted(numbers)))
-    assert ((ordered >= 0) & (ordered < len(instructions))).all()
-    assert (ordered.diff() >= 0).all()
-
-
 def test_a_word_that_is_not_in_the_vocabulary_is_warned_of_once(caplog) -> None:
     blue = TouchObject("blue", (0.20, 0.0))
     said = Instruction("Kindly touch the blue cube.", Touch(Ref("blue")))

@@ -74,14 +74,6 @@ def env(request: pytest.FixtureRequest) -> Iterator[gym.Env]:
 # -- Seeds and states ------------------------------------------------------------------
 
 
-def test_a_seed_gives_the_same_start_whatever_came_before(env: gym.Env) -> None:
-    start, _ = env.reset(seed=2000)
-    walk(env, 3)
-    assert same(env.reset(seed=2000)[0], start)
-    assert not same(env.reset()[0], start)
-    assert same(env.reset(seed=2000)[0], start)
-
-
 def test_a_seed_gives_the_same_sequence_of_episodes(env: gym.Env) -> None:
     short = gym.wrappers.TimeLimit(env.unwrapped, 3)
     actions, ends = [env.action_space.sample() for _ in range(7)], []

@@ -2,10 +2,10 @@
 
 import gymnasium as gym
 import pytest
+import sapien
 import torch
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.registration import REGISTERED_ENVS, register_env
-from mani_skill.utils.sapien_utils import look_at
 
 from ir_maniskill.agent import Agent, StateSpec
 from ir_maniskill.agent.config import AgentConfig
@@ -190,23 +190,33 @@ def test_senses_that_cannot_be_are_refused(own_senses, term, message) -> None:
 
 
 class ThreeCameras(TouchEnv):
-    """A robot with one eye more."""
+    """A robot with one eye more, on its left forearm."""
 
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
-        side = look_at(eye=[0.2, 0.6, 0.4], target=[0.2, 0, 0.05])
-        size = {"width": 32, "height": 64}
-        third = CameraConfig("side_camera", pose=side, fov=1, near=0.02, far=5, **size)
+        arm = self.agent.robot.links_map["LForeArm"]
+        kwargs = {"width": 32, "height": 64, "fov": 1, "near": 0.02, "far": 5}
+        third = CameraConfig("arm_camera", sapien.Pose(), mount=arm, **kwargs)
         return [*super()._default_sensor_configs, third]
 
 
 @pytest.mark.render
-def test_a_third_camera_is_seen(env_kwargs) -> None:
+def test_a_third_camera_that_moves_is_seen(env_kwargs) -> None:
     if "ThreeCameras-v1" not in REGISTERED_ENVS:
         kwargs = {"experiment": "NaoTouchCubeSingle-v1"}
         register_env("ThreeCameras-v1", max_episode_steps=32, **kwargs)(ThreeCameras)
     env = gym.make("ThreeCameras-v1", **env_kwargs)
-    state = StateStack(3).reset(env.reset(seed=0)[0])
+    obs, _ = env.reset(seed=0)
+    state = StateStack(3).reset(obs)
+    before, now = obs["sensor_param"], env.step(torch.ones(1, 26))[0]["sensor_param"]
+    still = [
+        torch.equal(*(p[name]["cam2world_gl"] for p in (before, now))) for name in now
+    ]
+    assert dict(zip(now, still, strict=True)) == {
+        "top_camera": True,
+        "front_camera": True,
+        "arm_camera": False,
+    }
     env.close()
     assert state["images"].shape == (1, 3, 3, 64, 32, 3)
     config = AgentConfig(critic="separate", auxiliary_weight=0, hidden=(8,))

@@ -12,8 +12,6 @@ import pytest
 import sapien
 import torch
 
-from ir_maniskill.environment import table_scene
-
 PARTS = 25  # draw calls for each picture: 21 of the robot, the room, three objects
 TRIANGLES = 1_650
 
@@ -71,7 +69,3 @@ def test_unlit_pictures_are_those_of_trivial():
         expected = pictures["trivial"][name]["rgb"]
         assert expected.float().std() > 10
         assert torch.equal(pictures["unlit"][name]["rgb"], expected)
-
-
-def test_unlit_promises_colors_only():
-    assert list(table_scene.UNLIT.texture_names) == ["Color"]

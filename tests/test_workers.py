@@ -13,10 +13,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from mani_skill.agents.registration import register_agent
 from mounts import disk
 
 from ir_maniskill.environment import shared_rows
 from ir_maniskill.environment.process_vector import ProcessVectorEnv, WorkerError
+from ir_maniskill.environment.robots import Nao
 from ir_maniskill.environment.vector import make_vec
 
 TASK = "NaoTouchCubeSingle-v1"
@@ -133,6 +135,19 @@ def test_workers_know_what_the_environment_says_now(
     monkeypatch.setenv("IR_MANISKILL_NAO_URDF", "/no/such.urdf")
     with pytest.raises(WorkerError, match=r"/no/such\.urdf: no such file"):
         make(1)
+
+
+@register_agent()
+class Twin(Nao):
+    """A robot that workers know only if they import this module."""
+
+    uid = "twin"
+
+
+def test_a_robot_of_ones_own_reaches_workers_by_its_name() -> None:
+    envs = make(1, robot_uids="twin")
+    assert envs.get_attr("robot_uids") == ("twin",)
+    envs.close()
 
 
 def test_a_failing_worker_says_why() -> None:

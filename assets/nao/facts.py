@@ -32,7 +32,7 @@ def link_frames() -> Frames:
     pending = [row for row in read("joints") if row["child_link"] != "torso"]
     while ready := [row for row in pending if row["parent_link"] in frames]:
         for row in ready:
-            motion = _joint_motion(row, angles.get(row["joint"], 0.0))
+            motion = joint_motion(row, angles.get(row["joint"], 0.0))
             frames[row["child_link"]] = frames[row["parent_link"]] @ motion
         pending = [row for row in pending if row["child_link"] not in frames]
     return frames
@@ -42,7 +42,8 @@ def _vector(row: Row, *columns: str) -> np.ndarray:
     return np.array([float(row[name]) for name in columns])
 
 
-def _joint_motion(row: Row, angle: float) -> np.ndarray:
+def joint_motion(row: Row, angle: float) -> np.ndarray:
+    """Return the frame of a joint's child in that of its parent, of a row of joints."""
     rpy = _vector(row, "roll_rad", "pitch_rad", "yaw_rad")
     motion = euler_matrix(*rpy, axes="sxyz")
     motion[:3, 3] = _vector(row, "origin_x_m", "origin_y_m", "origin_z_m")

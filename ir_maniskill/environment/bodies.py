@@ -14,15 +14,8 @@ from sapien.physx import PhysxRigidBodyComponent
 from torch import Tensor
 
 
-def positions(bodies: Sequence[Actor | Link]) -> Tensor:
-    """Return where bodies of one scene are [N, B, 3] [m]."""
-    if bodies[0].scene.gpu_sim_enabled:
-        return torch.stack([body.pose.p for body in bodies], dim=1)
-    return _of_each(bodies, lambda part: part.entity_pose.p)
-
-
 def poses(bodies: Sequence[Actor | Link]) -> Tensor:
-    """Return positions [m] and quaternions (w, x, y, z) of the bodies [N, B, 7]."""
+    """Return positions [m] and quaternions (w, x, y, z) of bodies [N, B, 7]."""
     if bodies[0].scene.gpu_sim_enabled:
         return torch.stack([body.pose.raw_pose for body in bodies], dim=1)
     return _of_each(bodies, _pose)

@@ -7,16 +7,15 @@ those of a scene at NAO's scale [m]. Legend: b scenes, C slots, B bodies, K cand
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from ir_maniskill.environment.robots.robot import Robot
 from ir_maniskill.environment.table_objects import EMPTY
 from ir_maniskill.experiment import Drawn, Experiment, Spoken
-from ir_maniskill.goals import DIRECTIONS, Goal, Push
-from ir_maniskill.language import Allows, Thing, kind_of
-from ir_maniskill.language.splits import acts_of
+from ir_maniskill.goals import DIRECTIONS, Push
+from ir_maniskill.language import Allows, Thing
 
 CANDIDATES = 40
 """Places that are tried for each object; if none is free it is left out."""
@@ -46,7 +45,8 @@ Laid = tuple[np.ndarray, np.ndarray]
 class Seats:
     """The objects of a list, each near its place, or in any of their places."""
 
-    def __init__(self, experiment: Experiment) -> None:
+    def __init__(self, experiment: Experiment, robot: Robot | type[Robot]) -> None:
+        self.hands = robot.hands
         self.places = np.array([thing.position for thing in experiment.bodies])
         self.jitter = experiment.jitter.position
         self.shuffled = experiment.shuffled
@@ -64,12 +64,8 @@ class Seats:
         return slots, xy + self.jitter * (2 * shift - 1)
 
     def allows(self, things: Sequence[Thing]) -> Allows:
-        """Return what says that anything may be asked: the experiment says what."""
-        return lambda acts: True
-
-    def has_hands(self, goal: Goal) -> bool:
-        """Return that there are hands for any goal: the experiment says what."""
-        return True
+        """Return whether the robot has the hands that verbs take; no more is asked."""
+        return lambda acts: hands_of(verb for verb, _ in acts) <= self.hands.keys()
 
 
 class Free:
@@ -127,13 +123,6 @@ class Free:
 
     # -- What can be asked -----------------------------------------------------------
 
-    def has_hands(self, goal: Goal) -> bool:
-        """Return whether the robot has the hands that a goal takes."""
-        if kind_of(goal) == "both":
-            return len(self.hands) == 2
-        verbs = [verb.split() for verb, _ in acts_of(goal)]
-        return {hand for hand, *what in verbs if what == ["hand"]} <= self.hands.keys()
-
     def allows(self, things: Sequence[Thing]) -> Allows:
         """Return whether the robot can do verbs to objects of a scene together.
 
@@ -159,7 +148,7 @@ class Free:
         first, _, last = verb.partition(" ")
         if first == "push":
             return self._can_push(last, index, things)
-        hands = [first] if last == "hand" else self.hands
+        hands = hands_of([verb]) or self.hands
         return any(self._touches(hand, np.array((x, y))) for hand in hands)
 
     def _touches(self, hand: str, xy: np.ndarray) -> np.ndarray:
@@ -224,9 +213,14 @@ def _away(places: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.linalg.norm(places - a - share[:, None] * way, axis=1)
 
 
+def hands_of(verbs: Iterable[str]) -> set[str]:
+    """Return the hands that verbs name, such as "left hand"."""
+    return {verb.removesuffix(" hand") for verb in verbs if verb.endswith(" hand")}
+
+
 def layout_of(experiment: Experiment, robot: Robot | type[Robot]) -> Seats | Free:
     """Return how the experiment's objects are laid out for a robot."""
     drawn, spoken = experiment.objects, experiment.instructions
     if isinstance(drawn, Drawn) and isinstance(spoken, Spoken):
         return Free(drawn, robot, spoken.split)
-    return Seats(experiment)
+    return Seats(experiment, robot)

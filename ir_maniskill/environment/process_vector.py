@@ -26,6 +26,8 @@ from torch import Tensor
 from ir_maniskill.environment import senses
 from ir_maniskill.environment.arguments import action_of, options_of, seeds_of
 from ir_maniskill.environment.host_tensor import HostTensor
+from ir_maniskill.environment.robots import Nao
+from ir_maniskill.environment.robots.robot import robot_class
 from ir_maniskill.environment.shared_rows import SharedRows, Tree, map_leaves, reserve
 from ir_maniskill.environment.worker import ENDS, work
 from ir_maniskill.experiment import Experiment
@@ -109,8 +111,10 @@ class ProcessVectorEnv(VectorEnv):
 
     def _make(self, env_kwargs: dict[str, Any]) -> None:
         """Have the envs made, learn their spaces and hand out the shared memory."""
-        own = senses.registered()
-        makes = [(self.experiment, own, rows, env_kwargs) for rows in self._rows]
+        # Reading the robot's class, a worker imports the module that registers it.
+        robot = robot_class(env_kwargs.get("robot_uids", Nao.uid))
+        known = self.experiment, robot, senses.registered()
+        makes = [(*known, rows, env_kwargs) for rows in self._rows]
         record, *spaces = self._command("make", makes)[0]
         self.single_observation_space, self.single_action_space = spaces
         self.observation_space, self.action_space = (
@@ -143,11 +147,6 @@ class ProcessVectorEnv(VectorEnv):
             WorkerError: A worker failed (another reset may do), died or hangs.
         """
         options = {} if options is None else options
-        if isinstance(options, dict) and "env_idx" in options:
-            raise ValueError(
-                "reset options: got 'env_idx', expected none: worker processes reset "
-                "all envs at once, and each by itself when its episode ends"
-            )
         if seed is None and not self._seeded:
             seed = FIRST_SEED
         count = self.num_envs

@@ -56,6 +56,11 @@ class RenderedEnv(BaseEnv):
     ) -> dict:
         """Observe; within a step pictures come last, in `_flatten_raw_obs`."""
         if not self._drawing:
+            if not self.scene.can_render():
+                raise ValueError(
+                    f"obs_mode: got {self.obs_mode!r} with the render_backend 'none', "
+                    "expected one without pictures (state, state_dict, none)"
+                )
             return super()._get_obs_with_sensor_data(info, apply_texture_transforms)
         return {
             "agent": self._get_obs_agent(),
@@ -84,8 +89,9 @@ class RenderedEnv(BaseEnv):
         return {name: _fetch_color(sensor) for name, sensor in sensors}
 
     def get_sensor_params(self) -> dict:
-        """Return the cameras' matrices, computed once: no camera ever moves."""
-        if self._sensor_params is None:
+        """Return the cameras' matrices, computed once if no camera moves."""
+        moving = any(sensor.camera.mount for sensor in self._sensors.values())
+        if self._sensor_params is None or moving:
             self._sensor_params = super().get_sensor_params()
         return self._sensor_params
 

@@ -101,10 +101,6 @@ def _touched(_: Any, info: Info) -> Tensor:
     return info["contact"].any(dim=2).float()
 
 
-def _wrong_once(_: Any, info: Info) -> Tensor:
-    return info["wrong_once"].float()[:, None]
-
-
 def _of_sentence(table: str) -> Measure:
     """Return what finds the active sentence's row of a table [I, ...]."""
     return lambda env, _: getattr(env.instructional_set, table)[env.instruction_index]
@@ -127,7 +123,7 @@ _TERMS = [
     _privileged("target_object", "C", lambda env, _: env.measure.serves.any(1).float()),
     _privileged("target_finger", "F", lambda env, _: env.measure.serves.any(2).float()),
     _privileged("gap", "1", lambda env, _: env.measure.gap[:, None]),
-    _privileged("wrong_once", "1", _wrong_once),
+    _privileged("wrong_once", "1", lambda _, info: info["wrong_once"].float()[:, None]),
     Term("named_position", "none", "3", read=_named_position),
     Term("snapshot", "none", "P", lambda env, _: env.judged().pack(), asked=True),
     Term(

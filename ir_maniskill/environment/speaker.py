@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ir_maniskill.environment.layout import Free, Seats
-from ir_maniskill.experiment import Experiment, Spoken, TouchObject, scene_of
+from ir_maniskill.environment.layout import Free, Seats, hands_of
+from ir_maniskill.experiment import Experiment, Spoken, scene_of
 from ir_maniskill.goals import Goal, GoalError, Instruction, Ref
 from ir_maniskill.language import Thing, draw, handwritten, kind_of, say
-from ir_maniskill.language.splits import acts_of, status
+from ir_maniskill.language.splits import acts_of, refs_of, status
 from ir_maniskill.language.tokens import split_words
 
 SCENES = 5000
@@ -49,11 +49,8 @@ class Speaker:
         self.spoken = experiment.instructions
         self.bodies = experiment.bodies
         self.layout = layout
-        self.by_hand = [
-            i
-            for i in handwritten()
-            if kind_of(i.goal) in self.spoken.kinds and layout.has_hands(i.goal)
-        ]
+        written = handwritten() if self.spoken.split == "wording" else ()
+        self.by_hand = [i for i in written if self._may_come_up(i.goal)]
 
     def draw(
         self,
@@ -94,14 +91,30 @@ class Speaker:
         wanted = wishes[left[0]].wanted
         asked = self.spoken if wanted is None else repr(wanted.text)
         raise GoalError(
-            f"instruction: got {asked}, expected what is true of one of {SCENES} scenes"
+            f"instruction: got {asked}, expected what is true of one of {SCENES} "
+            "scenes and, if it is drawn, what the robot's hands can do there"
+        )
+
+    def _may_come_up(self, goal: Goal) -> bool:
+        """Return whether there are the hands and the objects that a goal takes."""
+        hands, kind = self.layout.hands.keys(), kind_of(goal)
+        able = hands_of(verb for verb, _ in acts_of(goal)) <= hands
+        able &= kind != "both" or len(hands) == 2
+        there = all(map(self._is_there, refs_of(goal)))
+        return kind in self.spoken.kinds and able and there
+
+    def _is_there(self, ref: Ref) -> bool:
+        """Return whether a body has the color and shape of a reference."""
+        return any(
+            ref.color in (None, body.color) and ref.shape in (None, body.shape)
+            for body in self.bodies
         )
 
     def _wish(self, stream: np.random.RandomState) -> _Wish:
         """Return what is to be said in a scene that is yet to be drawn."""
-        rng, split = _rng(stream), self.spoken.split
+        rng = _rng(stream)
         kind = rng.choice(self.spoken.kinds)
-        if split == "wording" and rng.random() < BY_HAND:
+        if self.by_hand and rng.random() < BY_HAND:
             return _Wish(rng, self.by_hand[int(rng.random() * len(self.by_hand))])
         return _Wish(rng, kind=kind)
 
@@ -109,8 +122,10 @@ class Speaker:
         self, wish: _Wish, scene: Sequence[Thing], tried: int
     ) -> Instruction | None:
         """Return what is said of a scene; None: it does not do."""
-        if wish.wanted is None:
-            # A kind may be impossible, such as two hands for a robot with one.
+        never = tried > SCENES // 2 and not wish.free
+        if wish.wanted is None or never:
+            # What is listed may never fit what was written by hand. And a kind may be
+            # impossible, such as two hands for a robot with one.
             kinds = [wish.kind] if wish.kind and tried < PATIENCE else ()
             return self.say(scene, wish.rng, kinds)
         goal = wish.wanted.goal
@@ -163,8 +178,7 @@ def _rng(stream: np.random.RandomState) -> Random:
 
 def resolve(ref: Ref, scene: Sequence[Thing]) -> int | None:
     """Return which object of a scene a reference fits; None: none, or several."""
-    objects = [TouchObject(color, (x, y), shape) for color, shape, x, y in scene]
-    fits = ref.resolve(scene_of(objects))[0].nonzero().flatten().tolist()
+    fits = ref.resolve(scene_of(scene))[0].nonzero().flatten().tolist()
     return fits[0] if len(fits) == 1 else None
 
 

@@ -211,13 +211,6 @@ def view(scale: float, eye: Point, target: Point) -> Pose:
 
 
 def yaw_quaternion(yaw: np.ndarray) -> np.ndarray:
-    """Return rotations about the vertical as quaternions (w, x, y, z).
-
-    Args:
-        yaw: Angles of any shape [...] [rad].
-
-    Returns:
-        Unit quaternions [..., 4].
-    """
+    """Return rotations about the vertical [...] [rad] as (w, x, y, z) [..., 4]."""
     zero = np.zeros_like(yaw)
     return np.stack([np.cos(yaw / 2), zero, zero, np.sin(yaw / 2)], axis=-1)

@@ -33,7 +33,12 @@ from ir_maniskill.environment.layout import layout_of
 from ir_maniskill.environment.rendering import RenderedEnv
 from ir_maniskill.environment.reward_generator import RewardWeights
 from ir_maniskill.environment.robots import Nao
-from ir_maniskill.environment.robots.robot import Robot, available_robots, find_robot
+from ir_maniskill.environment.robots.robot import (
+    Robot,
+    available_robots,
+    find_robot,
+    robot_class,
+)
 from ir_maniskill.environment.speaker import Speaker
 from ir_maniskill.environment.table_objects import TableObjects
 from ir_maniskill.experiment import Experiment, ExperimentError, Spoken
@@ -136,8 +141,7 @@ class TouchEnv(RenderedEnv):
 
     @property
     def _default_sim_config(self) -> SimConfig:
-        uid = self.robot_uids
-        robot = available_robots()[uid] if isinstance(uid, str) else uid
+        robot = robot_class(self.robot_uids)
         cheap = SceneConfig(
             contact_offset=CONTACT_OFFSET * robot.scale,
             solver_position_iterations=robot.solver_iterations,
@@ -250,32 +254,29 @@ class TouchEnv(RenderedEnv):
         """Return the active sentence i_t of each env (N strings)."""
         return [instruction.text for instruction in self.instructions]
 
-    def tell(self, said: Any, env_idx: Tensor | None = None) -> None:
+    def tell(self, said: Any) -> None:
         """Give other instructions without a reset.
 
         What they ask for counts from here on: pushes from where things are now, and
         what was reached or fouled before is forgotten.
 
         Args:
-            said: A sentence, an `Instruction` or an index of the task's own, for all of
-                these envs or a list of one for each.
-            env_idx: Which envs; None: all.
+            said: A sentence, an `Instruction` or an index of the task's own, for all
+                envs or a list of one for each.
 
         Raises:
             ValueError: A sentence means nothing that the task or the language knows.
             GoalError: It does not fit the scene, or is too long; nothing has changed.
         """
-        if env_idx is None:
-            env_idx = torch.arange(self.num_envs, device=self.device)
-        told = instructions_of(said, self.experiment, len(env_idx))
-        known, index = self._told(env_idx, told)
-        start = self._start.clone()
-        start[env_idx] = self.table.poses()[env_idx]
+        everyone = torch.arange(self.num_envs, device=self.device)
+        told = instructions_of(said, self.experiment, self.num_envs)
+        known, index = self._told(everyone, told)
+        start = self.table.poses()
         scene = replace(self.snapshot(), start=start / self._size)
         self._goals = known.goals.deal(index, scene)  # what fits no object ends here
         self.instructional_set, self.instruction_index = known, index
         self._start = start
-        self._begin(env_idx)
+        self._begin(everyone)
 
     def _told(
         self, env_idx: Tensor, said: Sequence[Instruction]
@@ -488,8 +489,8 @@ class TouchEnv(RenderedEnv):
         task = self._task_state()
         for name, value in given.items():
             task[name][rows] = value.to(task[name])
-        self._restore_told(task["told"].byte())
         self.instruction_index = task["instruction_index"][:, 0].long()
+        self._restore_told(task["told"].byte())
         self.table.put(slice(None), task["slot"].long())
         self._stage = task["stage"][:, 0].long()
         self._success_once = task["success_once"][:, 0].bool()
@@ -498,9 +499,11 @@ class TouchEnv(RenderedEnv):
         self._resolve_goals()
 
     def _restore_told(self, text: Tensor) -> None:
-        """Tell envs the sentences [N, B] that they had been told."""
+        """Tell envs the sentences [N, B] that they had been told, if they count."""
         if not torch.equal(text, self.instructional_set.text[-self.num_envs :]):
-            said = {e: s for e, s in enumerate(senses.read_text(text)) if s}
+            counts = (self.instruction_index >= len(self.instructional_set)).tolist()
+            texts = zip(counts, senses.read_text(text), strict=True)
+            said = {env: s for env, (c, s) in enumerate(texts) if c and s}
             told = instructions_of(list(said.values()), self.experiment, len(said))
             told_then = dict(zip(said, told, strict=True))
             self.instructional_set = self.instructional_set.told(told_then)

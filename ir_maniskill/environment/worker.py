@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from ir_maniskill.environment import senses
+from ir_maniskill.environment.robots.robot import Robot
 from ir_maniskill.environment.senses import Term
 from ir_maniskill.environment.shared_rows import SharedRows, record_of
 from ir_maniskill.experiment import Experiment
@@ -52,12 +53,15 @@ class _Worker:
         self._pipe = pipe
 
     def make(
-        self, argument: tuple[Experiment, tuple[Term, ...], list[int], dict[str, Any]]
+        self,
+        argument: tuple[
+            Experiment, type[Robot], tuple[Term, ...], list[int], dict[str, Any]
+        ],
     ) -> Any:
         """Make the envs; the first worker describes them for all."""
         from ir_maniskill.registration import register
 
-        experiment, terms, self._rows, kwargs = argument
+        experiment, _, terms, self._rows, kwargs = argument
         for term in terms:
             senses.register(term)
         register(experiment)

@@ -22,7 +22,7 @@ from mani_skill.agents.registration import REGISTERED_AGENTS
 from mani_skill.utils.structs import Actor
 from torch import Tensor
 
-from ir_maniskill.environment.bodies import positions
+from ir_maniskill.environment.bodies import poses
 from ir_maniskill.environment.contacts import CpuTouchSensor, GpuTouchSensor
 from ir_maniskill.environment.robots.controller import TargetControllerConfig
 from ir_maniskill.environment.robots.loader import read_builder
@@ -110,9 +110,9 @@ class Robot(BaseAgent, ABC):
         Raises:
             ExperimentError: An object may lie too far from every shoulder.
         """
-        slack = experiment.jitter.position * math.sqrt(2)
         if isinstance(experiment.objects, Drawn):
             return  # what is drawn is drawn within reach
+        slack = experiment.jitter.position * math.sqrt(2)
         for thing in experiment.objects:
             place = [cls.scale * value for value in thing.position]
             far = min(math.dist(place, shoulder) for shoulder in cls.shoulders)
@@ -297,7 +297,7 @@ class Robot(BaseAgent, ABC):
 
     def finger_position(self) -> Tensor:
         """Return where the fingertips' links are [N, F, 3] [m]."""
-        return positions(self.fingertip_links)
+        return poses(self.fingertip_links)[..., :3]
 
     def _ordered(self, joints: Tensor) -> Tensor:
         """Reorder [N, J] from the simulator's order to the action's."""
@@ -333,6 +333,12 @@ def find_robot(robot: str | type[BaseAgent]) -> str | type[Robot]:
         f"robot_uids: got {robot!r}, expected a subclass of Robot or the name of a "
         f"registered one, available: {', '.join(map(short_name, uids))}"
     )
+
+
+def robot_class(robot: str | type[BaseAgent]) -> type[Robot]:
+    """Return the class of a robot; arguments and errors are those of `find_robot`."""
+    found = find_robot(robot)
+    return available_robots()[found] if isinstance(found, str) else found
 
 
 OURS = "ir_"
