@@ -50,4 +50,4 @@ __all__ = [
     "touch_instructions",
     "train",
 ]
-__version__ = "0.2.0"
+__version__ = "0.3.0.dev0"

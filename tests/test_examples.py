@@ -65,13 +65,6 @@ def test_random_actions_leave_a_film(tmp_path: Path) -> None:
     assert len(list(tmp_path.glob("runs/random_actions/*.mp4"))) == 1
 
 
-@pytest.mark.slow
-def test_custom_experiment_can_be_stepped(tmp_path: Path) -> None:
-    out = run(tmp_path, script("custom_experiment.py"))
-    assert "lemon" in out
-    assert -2 < float(out.split("dense reward:")[1]) < 2
-
-
 @pytest.mark.render
 @pytest.mark.slow
 def test_vector_envs_finish_two_episodes_each(tmp_path: Path) -> None:

@@ -250,29 +250,6 @@ def test_a_best_policy_that_is_broken_is_refused_before_training(tmp_path, inter
         run(toy_config(tmp_path), resume=True)
 
 
-OFFICE = {
-    "a byte order mark": lambda text: "\ufeff" + text,
-    "semicolons": lambda text: text.replace(",", ";"),
-    "decimal commas": lambda text: text.replace(",", ";").replace(".", ","),
-}
-"""How office programs save a table."""
-
-
-@pytest.mark.parametrize("change", OFFICE.values(), ids=OFFICE)
-def test_a_run_goes_on_from_tables_that_office_programs_saved(tmp_path, change):
-    run(toy_config(tmp_path, total_steps=2 * UPDATE))
-    before = {name: rows(tmp_path, name) for name in ("metrics", "evaluations")}
-    for name in before:
-        table = tmp_path / f"{name}.csv"
-        table.write_bytes(change(table.read_bytes().decode()).encode())
-    run(toy_config(tmp_path, total_steps=3 * UPDATE), resume=True)
-    for name, there in before.items():
-        assert rows(tmp_path, name)[: len(there)] == there
-    assert [int(row["steps"]) for row in rows(tmp_path, "metrics")] == [
-        UPDATE * i for i in (1, 2, 3)
-    ]
-
-
 @pytest.mark.parametrize("text", ["step,return\n1,2\n", "steps,return\nmany,2\n"])
 def test_a_table_that_is_none_is_named(tmp_path, text):
     run(toy_config(tmp_path, total_steps=UPDATE))

@@ -26,6 +26,7 @@ from ir_maniskill.goals import (
     Ref,
     Touch,
 )
+from ir_maniskill.language.draw import things
 from ir_maniskill.language.tokens import split_words
 from ir_maniskill.snapshot import Snapshot
 
@@ -220,9 +221,10 @@ def _refs(refs: list[Ref], device: torch.device) -> Deal:
         wrong = counts & (masks.sum(dim=1) != 1)
         if wrong.any():
             env = int(wrong.nonzero()[0])
+            there = ", ".join(f"{t.color} {t.shape}" for t in things(scene)[env])
             raise GoalError(
                 f"{distinct[int(used[env])]}: got {int(masks[env].sum())} objects that "
-                f"fit in env {env}, expected exactly one"
+                f"fit in env {env}, expected exactly one of its {there}"
             )
         return masks
 

@@ -250,7 +250,7 @@ class Session:
         """Return sentences to try: the task's, or some that can be done here."""
         if known := self._known():
             color = next(name for name in self.names if name).split()[0]
-            more = (f"please tap the {color} one", "Touch the leftmost one.", "dance!")
+            more = (f"please tap the {color} one", "Touch the leftmost one.")
             return [*[i.text for i in known[:5]], *more]
         (here,) = things(replace(self.scene, start=self.scene.pose))
         allows = layout_of(self.env.experiment, self.env.agent).allows(here)
@@ -259,7 +259,7 @@ class Session:
             with suppress(GoalError):  # of some scenes there is little to say
                 goal = draw(here, [kind], rng, allows=allows)
                 found.append(min((say(goal, rng) for _ in range(20)), key=len))
-        return [*found, "dance!"]
+        return found
 
     # -- Objects -----------------------------------------------------------------------
 

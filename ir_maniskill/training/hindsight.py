@@ -21,7 +21,7 @@ from ir_maniskill.environment import reward_generator
 from ir_maniskill.environment.instructional_set import GoalBatch, GoalTable
 from ir_maniskill.environment.layout import layout_of
 from ir_maniskill.environment.reward_generator import Verdict
-from ir_maniskill.environment.robots.robot import available_robots, find_robot
+from ir_maniskill.environment.robots.robot import robot_class
 from ir_maniskill.environment.senses import read_text, text_of, tokens_of
 from ir_maniskill.environment.speaker import Speaker
 from ir_maniskill.experiment import Experiment, Spoken
@@ -96,8 +96,7 @@ class Hindsight:
     def of(cls, config: TrainConfig, others: int) -> Hindsight:
         """Return that of a training's task and robot."""
         experiment = catalog.get(config.env_id)
-        robot = find_robot(config.robot)
-        robot = available_robots()[robot] if isinstance(robot, str) else robot
+        robot = robot_class(config.robot)
         dense = config.reward_mode == "dense"
         weights = config.reward_weights.vector() if dense else None
         speaker = None

@@ -175,15 +175,9 @@ def stored_config(folder: Path) -> TrainConfig | None:
 
 
 def whole_rows(table: Path) -> list[dict[str, str]]:
-    """Return the complete rows of a CSV table; a crash may have cut the last one.
-
-    Office programs may have saved it: with a byte order mark, semicolons, decimal
-    commas.
-    """
-    with table.open(newline="", encoding="utf-8-sig", errors="replace") as file:
+    """Return the complete rows of a CSV table; a crash may have cut the last one."""
+    with table.open(newline="", encoding="utf-8", errors="replace") as file:
         lines = [line for line in file if line.endswith("\n")]
-    if lines and ";" in lines[0]:
-        lines = [line.replace(",", ".").replace(";", ",") for line in lines]
     rows = csv.DictReader(lines)
     return [row for row in rows if None not in row and None not in row.values()]
 

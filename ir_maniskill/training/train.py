@@ -143,8 +143,11 @@ def run(
         runner = Runner(config, folder, envs, evaluated_in, chosen)
         if stored is not None:
             runner.restore(stored)
-        elif config.init_from is not None:
-            _give_weights(config.init_from, runner.algorithm.agent)
+        else:
+            if resume:
+                log.info("no checkpoint in %s: a new run begins", config.out)
+            if config.init_from is not None:
+                _give_weights(config.init_from, runner.algorithm.agent)
         runner.learn()
     return folder.best
 
