@@ -72,6 +72,13 @@ class TouchEnv(RenderedEnv):
     **Success Conditions:**
     - the goal holds, e.g. a finger touches the named object. This does not end the
       episode, since holding it is what is rewarded; the time limit does.
+
+    **Order of calls:**
+    - once: `_load_scene`, `_after_reconfigure`
+    - a reset: `_initialize_episode` lays objects out, chooses sentences, and looks up
+      what they refer to
+    - a step: `_before_control_step` forgets contacts, `_after_simulation_step` collects
+      them after each physics step, `evaluate` judges, then come reward and observation
     """
 
     metadata: ClassVar = {**BaseEnv.metadata, "render_fps": CONTROL_FREQ}
