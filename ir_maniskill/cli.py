@@ -446,10 +446,11 @@ def _describe(experiment: Experiment) -> tuple[str, str, str, str, str]:
         colors = ", ".join(thing.color for thing in drawn)
         things = f"{colors}; {'shuffled' if experiment.shuffled else 'in place'}"
     if isinstance(spoken, Spoken):
-        said = f"the language: {', '.join(spoken.kinds)}"
+        said, level = f"the language: {', '.join(spoken.kinds)}", "the goal's level"
     else:
         said = spoken[0].text + f" (+{len(spoken) - 1})" * (len(spoken) > 1)
-    reward = {"binary": "+1 if touched", "per_finger": "+1 a finger"}
+        level = "+1 per finger"
+    reward = {"binary": "+1 if touched", "per_finger": level}
     penalty = (
         f", -{experiment.wrong_penalty:g} wrong" if experiment.wrong_penalty else ""
     )
