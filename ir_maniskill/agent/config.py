@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from ir_maniskill.checks import require, require_fields, require_types
 from ir_maniskill.environment.senses import available
@@ -11,16 +11,6 @@ from ir_maniskill.language.tokens import VOCABULARY
 Vision = Literal["patches", "paper", "objects"]
 ActorKind = Literal["gaussian", "squashed"]
 CriticInput = Literal["asymmetric", "separate", "none"]
-
-CONSTANT = {
-    "language_layers": 3,
-    "language_heads": 2,
-    "language_width": 50,
-    "vision_channels": [32, 32, 32],
-    "vision_width": 256,
-    "body_width": 128,
-}
-"""Fields of earlier configs: no agent has ever had other sizes."""
 
 
 @dataclass(frozen=True)
@@ -77,33 +67,3 @@ class AgentConfig:
         felt = {"proprioception", "target", "state"} & set(senses or ())
         fits = gain == 0 or senses is None or bool(felt)
         require(fits, "posture_gain", gain, "0 where joints are not felt")
-
-
-def without_constants(old: dict[str, Any]) -> dict[str, Any]:
-    """Return plain data without what is no longer to choose."""
-    for name in CONSTANT.keys() & old.keys():
-        require(old[name] == CONSTANT[name], name, old[name], str(CONSTANT[name]))
-    return {name: value for name, value in old.items() if name not in CONSTANT}
-
-
-def from_version_1(old: dict[str, Any]) -> dict[str, Any]:
-    """Return the plain data that 0.1 wrote in today's form; its policies act as before.
-
-    What is not whole is left to whoever decodes it.
-    """
-    new = {"posture_gain": 0.0, "language": "tokens", **old}
-    new.setdefault("language_length", 5)  # of the paper's sentences
-    senses, told = new.get("senses"), new.pop("sees_target", True)
-    if isinstance(senses, list | tuple) and told and "proprioception" in senses:
-        place = senses.index("proprioception") + 1
-        new["senses"] = [*senses[:place], "target", *senses[place:]]
-    size = new.get("vocabulary")
-    if type(size) is int and 1 < size < 10**5:  # else it is no file of ours
-        others = (f"<{index}>" for index in range(len(VOCABULARY), size))
-        new["vocabulary"] = [*VOCABULARY, *others][:size]
-    if new.get("critic") == "shared":  # nothing of it is left where a policy acts
-        new["critic"] = "separate"
-    film = new.pop("film", True)
-    fits = film or new.get("vision") == "paper"
-    require(fits, "film", film, "true: without it there is only the paper's vision")
-    return new

@@ -34,7 +34,7 @@ CHECKPOINT, POLICY = "checkpoint", "policy"
 """The kinds of file."""
 
 FORMAT = 2
-"""Version of the form of both; that of ir_maniskill 0.1 is 1."""
+"""Version of the form of both."""
 
 TRAINING_ONLY = ("critic.", "critic_encoder.", "locator.")
 """Weights that a policy file leaves out."""
@@ -85,10 +85,10 @@ def write(path: Path, stored: Stored) -> None:
 
 
 def read(path: Path) -> Stored:
-    """Return the contents of a checkpoint or policy file, in today's form.
+    """Return the contents of a checkpoint or policy file.
 
     Raises:
-        CheckpointError: It is missing, foreign, broken, or of a later version.
+        CheckpointError: It is missing, foreign, broken, or of another version.
     """
     path = Path(path)
     if path.exists() and not path.is_file():  # reading a pipe might never end
@@ -100,14 +100,13 @@ def read(path: Path) -> Stored:
         if owner != "ir_maniskill" or kind not in (CHECKPOINT, POLICY):
             raise ValueError(f"its kind is {header.get('kind')!r}")
         metadata = json.loads(header["metadata"])
-        if int(version) > FORMAT:
+        if int(version) != FORMAT:
             raise CheckpointError(
                 f"{path}: got a file of format {version}, written by ir_maniskill "
-                f"{metadata.get('version')}; expected format {FORMAT} at most: upgrade"
+                f"{metadata.get('version', '0.1')}; expected format {FORMAT}: use that "
+                "version, or train anew"
             )
         stored = Stored(kind, parse_tensors(path.read_bytes()), metadata)
-        if int(version) == 1:
-            stored = _from_version_1(stored)
         if broken := not_finite(stored.tensors):
             raise ValueError(f"{', '.join(broken)} is not finite")
         return stored
@@ -123,54 +122,6 @@ def read(path: Path) -> Stored:
             f"({shorten(str(error), 300)}); expected a checkpoint or policy of "
             "ir_maniskill: restore it, or train anew"
         ) from error
-
-
-# -- Files of 0.1 ----------------------------------------------------------------------
-
-
-def _from_version_1(stored: Stored) -> Stored:
-    """Return what 0.1 wrote in today's form; its policy acts as before."""
-    tensors = _dequantized(stored.tensors)
-    metadata = json.loads(json.dumps(stored.metadata))
-    agent, old = metadata["config"]["agent"], metadata["spec"]
-    agent["language_length"] = old["tokens"]
-    prefix = "agent." if stored.kind == CHECKPOINT else ""
-    gain = tensors.pop(f"{prefix}actor.posture_gain", None)
-    if gain is not None:  # it changed as training went on
-        agent |= {"posture_gain": float(gain), "posture_gain_final": None}
-    frames, joints, fingers = old["frames"], old["joints"], old["fingers"]
-    shapes = {
-        "instruction": [old["tokens"]],
-        "proprioception": [frames, joints],
-        "target": [frames, joints],
-        "touch": [frames, fingers],
-    }
-    if old["cameras"]:
-        cameras = [old[name] for name in ("cameras", "height", "width")]
-        shapes["images"] = [frames, *cameras, 3]
-    if old["privileged"]:
-        shapes["privileged"] = [old["privileged"]]
-    metadata["spec"] = {"shapes": shapes, "actions": old["actions"]}
-    return Stored(stored.kind, tensors, metadata)
-
-
-def _dequantized(stored: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return weights that 0.1 stored as whole numbers of 4 or 8 bits, and all others.
-
-    Beside the numbers [O, I] stand the scales of their rows [O]; two numbers of 4 bits
-    share a byte.
-    """
-    weights: dict[str, Tensor] = {}
-    for name, tensor in stored.items():
-        scale = stored.get(name + ".scale")
-        if scale is not None:
-            if tensor.dtype == torch.uint8:
-                pairs = torch.stack([tensor & 15, tensor >> 4], dim=2).flatten(1)
-                tensor = pairs.to(torch.int8) - 8
-            tensor = tensor * scale[:, None]
-        if name.removesuffix(".scale") not in stored or not name.endswith(".scale"):
-            weights[name] = tensor
-    return weights
 
 
 # -- Policies --------------------------------------------------------------------------
@@ -241,9 +192,9 @@ def load_agent(path: Path | str) -> tuple[Agent, TrainConfig, dict[str, Any]]:
         agent.load_state_dict(weights, assign=True)
     except MALFORMED as error:
         raise CheckpointError(
-            f"{path}: its weights and its config do not belong together "
-            f"({shorten(str(error), 300)}); expected a file of this version of "
-            "ir_maniskill"
+            f"{path}, written by ir_maniskill {stored.metadata.get('version')}: its "
+            "weights and its config do not belong together "
+            f"({shorten(str(error), 300)}); expected a file of this version"
         ) from error
     return agent.eval(), config, stored.metadata
 

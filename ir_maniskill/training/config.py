@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from ir_maniskill.agent.agent import asks
-from ir_maniskill.agent.config import AgentConfig, from_version_1, without_constants
+from ir_maniskill.agent.config import AgentConfig
 from ir_maniskill.checks import ConfigError, require, require_fields, require_types
 from ir_maniskill.environment.reward_generator import RewardWeights
 
@@ -336,74 +336,19 @@ def to_data(config: TrainConfig) -> dict[str, Any]:
 
 
 def from_data(data: object) -> TrainConfig:
-    """Return the configuration from plain data of this version or an earlier one.
+    """Return the configuration from plain data of this version.
 
     Raises:
         ConfigError: If a field is unknown, missing, of another type or out of its
-            range, or a later version of the package wrote it.
+            range, or another version of the package wrote it.
     """
-    config: TrainConfig = _decode(TrainConfig, migrate(data), "TrainConfig")
+    if isinstance(data, dict):
+        schema = data.get("schema", 1)
+        expected = f"{SCHEMA}: another version of ir_maniskill wrote this; use that one"
+        require(schema == SCHEMA, "schema", schema, expected)
+        data = {name: value for name, value in data.items() if name != "schema"}
+    config: TrainConfig = _decode(TrainConfig, data, "TrainConfig")
     return config
-
-
-def migrate(data: object) -> object:
-    """Return a config's plain data of any version in today's form, without `schema`.
-
-    What no dictionary is, or lacks what its version has, is left to be refused.
-    """
-    if not isinstance(data, dict):
-        return data
-    fields = dict(data)
-    schema = fields.pop("schema", 1)
-    require(schema in range(1, SCHEMA + 1), "schema", schema, f"1 to {SCHEMA}")
-    if schema == 1:
-        fields = _from_version_1(fields)
-    if isinstance(agent := fields.get("agent"), dict):
-        fields["agent"] = without_constants(agent)
-        if schema < 3:
-            fields["agent"] = {"actor": "gaussian", **fields["agent"]}
-    if schema < 3:
-        new = {"algorithm": "ppo", "sac": dataclasses.asdict(SACConfig())}
-        fields = {**new, "init_from": None, **fields}
-    return fields
-
-
-def _from_version_1(old: dict[str, Any]) -> dict[str, Any]:
-    """Return the plain data of 0.1 in the form of version 2; policies act as before."""
-    new = {"sim_backend": "physx_cpu", "render_backend": "auto", "robot": "nao", **old}
-    parts = ("agent", "ppo", "dense_weights")
-    if not all(isinstance(new.get(part), dict) for part in parts):
-        return new  # decoding says what is missing
-    agent, ppo, dense = ({**new.pop(part)} for part in parts)
-    try:
-        new["penalty_warmup"] = new.pop("lenient_steps", 0) / new["total_steps"]
-        ppo["steps_per_update"] = ppo.pop("rollouts") * ppo.pop("rollout_length")
-        falls = agent.pop("std_mode") in ("annealed", "decayed")
-        ppo["std"], final = agent.pop("std"), agent.pop("std_final")
-        ppo["std_final"] = final if falls else ppo["std"]
-        new["reward_weights"] = {
-            "hold": 1.0,
-            "approach": dense["reach"],
-            "gather": dense["gather"],
-            "foul": dense["wrong"],
-            "speed": dense.get("push", 0.0),
-            "after_foul": dense["spoiled"],
-        }
-    except (KeyError, TypeError, ArithmeticError) as error:
-        raise ConfigError(
-            f"config of version 1: got one that is not whole ({error!r}), expected the "
-            "fields of ir_maniskill 0.1"
-        ) from error
-    # The policy that was kept acts with the gain of the end.
-    gain = agent.pop("posture_gain_final", None) or agent.get("posture_gain", 0.0)
-    new |= {"agent": from_version_1(agent | {"posture_gain": gain}), "ppo": ppo}
-    for name in ("eval_seed", "stop_at_success"):
-        new.pop(name, None)
-    for name in ("value_weight", "entropy_weight", "normalize_reward", "max_kl"):
-        ppo.pop(name, None)
-    if new.get("reward_mode") == "normalized_dense":
-        new["reward_mode"] = "dense"
-    return new
 
 
 def _decode(hint: Any, value: Any, name: str) -> Any:
