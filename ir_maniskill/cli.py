@@ -350,9 +350,14 @@ def run(arguments: Sequence[str]) -> int:
     """Carry out one command and return its exit code."""
     try:
         command = parse(arguments)
-        return command.run() or 0
+        code = command.run() or 0
+        sys.stdout.flush()
+        return code
     except KeyboardInterrupt:
         return 130
+    except BrokenPipeError:  # who reads has seen enough, as `head` has
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except (ValueError, RuntimeError, OSError) as error:
         print(f"ir-maniskill: error: {_in_one_line(error)}", file=sys.stderr)
         return 2

@@ -1,7 +1,9 @@
 import dataclasses
 import json
+import os
 import shlex
 import signal
+import sys
 
 import pytest
 import torch
@@ -220,6 +222,15 @@ def test_ctrl_c_exits_with_130(monkeypatch):
 
     monkeypatch.setattr(cli, "train", interrupt)
     assert cli.run(["train", IDS[0]]) == 130
+
+
+def test_a_reader_who_has_seen_enough_is_no_error(monkeypatch, capsys):
+    read, write = os.pipe()
+    os.close(read)
+    with open(write, "w") as closed:
+        monkeypatch.setattr(sys, "stdout", closed)
+        assert cli.run(["tasks"]) == 0
+    assert capsys.readouterr().err == ""
 
 
 @pytest.fixture

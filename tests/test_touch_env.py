@@ -173,6 +173,15 @@ def test_pictures_that_a_shader_pack_cannot_draw_are_refused() -> None:
         )
 
 
+def test_a_shader_pack_that_is_not_there_is_refused() -> None:
+    with pytest.raises(ValueError, match="'unlt', available: .*trivial, unlit"):
+        gym.make(
+            "NaoTouchCubeSingle-v1",
+            obs_mode="rgb",
+            sensor_configs={"shader_pack": "unlt"},
+        )
+
+
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [

@@ -12,6 +12,7 @@ import numpy as np
 import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.render.shaders import PREBUILT_SHADER_CONFIGS
 from mani_skill.sensors.camera import Camera
 from torch import Tensor
 
@@ -28,7 +29,11 @@ class RenderedEnv(BaseEnv):
     def _setup_sensors(self, options: dict) -> None:
         # Picture formats are global: a video camera made earlier leaves floats behind.
         sapien.render.set_picture_format("Color", "r8g8b8a8unorm")
-        super()._setup_sensors(options)
+        try:
+            super()._setup_sensors(options)
+        except KeyError as error:
+            known = ", ".join(PREBUILT_SHADER_CONFIGS)
+            raise ValueError(f"shader_pack: got {error}, available: {known}") from None
         self._sensor_params: dict | None = None
         wanted = {kind for kind, on in vars(self.obs_mode_struct.visual).items() if on}
         self._colors_only = wanted == {"rgb"} and not self._sim_device.is_cuda()

@@ -63,7 +63,8 @@ def train(
         envs: Vector of this rank's envs to use (and leave open) instead of making one.
         eval_envs: The same for evaluations, which only the first rank makes.
         algorithm: What learns; None: what the config names.
-        preset: Which of `CONFIGS` to train a task with.
+        preset: Which of `CONFIGS` to train a task with; a run that is resumed keeps
+            its own.
         **changes: Fields that shall be other than in the preset, or in `task`. With
             `init_from`, the policy decides instead of the preset what its weights need.
 
