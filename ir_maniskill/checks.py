@@ -4,7 +4,6 @@ import math
 import types
 import typing
 from collections.abc import Callable
-from functools import partial
 from numbers import Integral
 from typing import Any, Literal
 
@@ -59,23 +58,24 @@ def require_fields(
 
 
 def require_types(config: object) -> None:
-    """Raise ConfigError unless fields of plain and Literal types have such values."""
+    """Raise ConfigError unless each field has a value of the type that it is to have."""
     for name, hint in typing.get_type_hints(type(config)).items():
-        kinds, origin = typing.get_args(hint) or (hint,), typing.get_origin(hint)
-        if origin is Literal:
-            expected = "one of " + ", ".join(map(repr, kinds))
-            require_fields(config, name, kinds.__contains__, expected)
-        elif origin in (None, types.UnionType) and {*kinds} <= PLAIN:
-            expected = " or ".join(kind.__name__ for kind in kinds)
-            fits = partial(_is_one_of, kinds=kinds)
-            require_fields(config, name, fits, f"a value of type {expected}")
+        expected = f"a value of type {hint.__name__ if type(hint) is type else hint}"
+        if typing.get_origin(hint) is Literal:
+            expected = "one of " + ", ".join(map(repr, typing.get_args(hint)))
+        value = getattr(config, name)
+        require(_is_a(value, hint), name, value, expected)
 
 
-PLAIN = {int, float, bool, str, types.NoneType}
-
-
-def _is_one_of(value: object, kinds: tuple[type, ...]) -> bool:
-    """Whether a value is of one of the types: integers are floats, truth no number."""
+def _is_a(value: object, hint: Any) -> bool:
+    """Whether a value is of a type: integers are floats, truth is no number."""
+    kinds, origin = typing.get_args(hint), typing.get_origin(hint)
+    if origin is types.UnionType:
+        return any(_is_a(value, kind) for kind in kinds)
+    if origin is Literal:
+        return value in kinds
+    if origin is tuple:  # of any length
+        return isinstance(value, tuple) and all(_is_a(v, kinds[0]) for v in value)
     if isinstance(value, bool):
-        return bool in kinds
-    return isinstance(value, (*kinds, int) if float in kinds else kinds)
+        return hint is bool
+    return isinstance(value, (int, float) if hint is float else hint)

@@ -50,11 +50,11 @@ class AgentConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
+        require_types(self)
         for sense in self.senses or ():
             known = ", ".join(map(repr, available()))
             require(sense in available(), "senses", sense, f"one of {known}")
         require(self.senses != (), "senses", self.senses, "at least one, or None")
-        require_types(self)
         words, units = self.vocabulary, self.hidden
         require(len(words) > 1, "vocabulary", words, "<pad>, <unk> and words")
         fits = 1 <= len(units) <= 100 and min(units) > 0

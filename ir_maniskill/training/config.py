@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-import types
 import typing
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -347,42 +346,22 @@ def from_data(data: object) -> TrainConfig:
         expected = f"{SCHEMA}: another version of ir_maniskill wrote this; use that one"
         require(schema == SCHEMA, "schema", schema, expected)
         data = {name: value for name, value in data.items() if name != "schema"}
-    config: TrainConfig = _decode(TrainConfig, data, "TrainConfig")
+    config: TrainConfig = _decode(TrainConfig, data)
     return config
 
 
-def _decode(hint: Any, value: Any, name: str) -> Any:
-    """Return the JSON value as the annotated type, or raise ConfigError."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if dataclasses.is_dataclass(hint):
-        return _decode_fields(typing.cast("type", hint), value)
-    if origin in (types.UnionType, typing.Union):
-        if value is None and type(None) in arguments:
-            return None
-        return _decode(arguments[0], value, name)
-    if origin is tuple:
-        require(isinstance(value, list | tuple), name, value, "a list")
-        return tuple(_decode(arguments[0], item, name) for item in value)
-    if origin is Literal:
-        return value  # its class refuses others
-    if hint is float and type(value) is int:
-        return float(value)
-    require(type(value) is hint, name, value, f"a value of type {hint.__name__}")
-    return value
-
-
-def _decode_fields(cls: type, data: Any) -> Any:
+def _decode(cls: Any, data: Any) -> Any:
     """Return the dataclass `cls` from plain data that has exactly its fields."""
     require(isinstance(data, dict), cls.__name__, data, "an object of its fields")
-    hints = typing.get_type_hints(cls)
+    hints, fields = typing.get_type_hints(cls), dict[str, Any]()
     unknown, missing = sorted(data.keys() - hints), sorted(hints.keys() - data)
     expected = f"exactly its fields (missing: {missing}, unknown: {unknown})"
     require(not unknown and not missing, cls.__name__, sorted(data), expected)
-    fields = {name: _decode(hints[name], data[name], name) for name in hints}
-    try:
-        return cls(**fields)
-    except ValueError as error:  # the environment's classes know no ConfigError
-        raise ConfigError(str(error)) from error
+    for name, value in data.items():
+        part = dataclasses.is_dataclass(hints[name])
+        value = _decode(hints[name], value) if part else value
+        fields[name] = tuple(value) if isinstance(value, list) else value
+    return cls(**fields)
 
 
 # -- Resuming --------------------------------------------------------------------------
