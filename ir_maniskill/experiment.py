@@ -425,6 +425,8 @@ def get(experiment_id: str) -> Experiment:
 
 
 def _import(module: str) -> None:
+    expected = "one by its name, as `import` takes it: no path"
+    _require(not module.startswith("."), "module of the task", module, expected)
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
     try:

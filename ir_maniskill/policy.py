@@ -174,8 +174,10 @@ class Policy:
 
     def _see(self, obs: Observation) -> State:
         """Add an observation to the history, and return the state."""
-        expected = "a dict: make the env with the policy's `env_kwargs`"
-        require(isinstance(obs, Mapping), "observation", type(obs).__name__, expected)
+        told = isinstance(obs, Mapping) and obs.get("extra", {}).get("instruction")
+        expected = "a dict of tensors, with what is said: make the env with the "
+        expected += "policy's `env_kwargs`"
+        require(isinstance(told, Tensor), "observation", type(obs).__name__, expected)
         done, self._done, count = self._done, None, len(obs["extra"]["instruction"])
         if self._stack is None:
             self._stack, self._count = StateStack(self.config.frames), count
@@ -202,9 +204,9 @@ def load_policy(
     Raises:
         CheckpointError: There is no such file, or it cannot be used.
     """
-    path = shipped(str(id_or_path))
-    if not path.exists():
-        path = Path(id_or_path)
+    path, own = Path(id_or_path), shipped(str(id_or_path))
+    if own.exists() and id_or_path in catalog.available():
+        path = own
     if path.is_dir():
         path = path / "best.safetensors"
     if not path.exists():

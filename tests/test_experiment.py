@@ -61,6 +61,8 @@ def test_unknown_id_lists_what_there_is() -> None:
         catalog.get("NaoTouchCubeSolo-v1")
     assert "'NaoTouchCubeSolo-v1'" in str(error.value)
     assert all(task_id in str(error.value) for task_id in IDS)
+    with pytest.raises(ExperimentError, match="module of the task: got './mine.py'"):
+        catalog.get("./mine.py:Mine-v1")
 
 
 def test_an_id_cannot_be_taken_twice() -> None:

@@ -1,7 +1,9 @@
 """A loaded policy acts on what envs observe, and remembers what it saw."""
 
 import logging
+import shutil
 
+import numpy as np
 import pytest
 import torch
 
@@ -9,6 +11,7 @@ import ir_maniskill
 from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.robots import Nao
 from ir_maniskill.environment.senses import StateStack, read_text
+from ir_maniskill.policy import shipped
 from ir_maniskill.training.checkpoint import CheckpointError, MismatchError
 
 TASK = "NaoTouchCubeMulti-v1"
@@ -88,10 +91,18 @@ def test_it_can_be_told_any_sentence(policy, caplog):
     assert told("").shape == (2, 26)
 
 
-def test_a_flat_observation_is_refused(policy):
-    policy.reset()
-    with pytest.raises(ValueError, match=r"got 'Tensor', expected a dict.*env_kwargs"):
-        policy.act(torch.zeros(1, 78))
+@pytest.mark.parametrize(
+    "obs",
+    [
+        torch.zeros(1, 78),
+        {"agent": {"qpos": torch.zeros(1, 9)}, "extra": {}},
+        {"agent": {}, "extra": {"instruction": np.zeros((1, 5))}},
+    ],
+)
+def test_observations_of_other_envs_are_refused(obs):
+    policy = ir_maniskill.load_policy("NaoInstruct-v1", device="cpu")
+    with pytest.raises(ValueError, match="observation: got .* a dict of t.*env_kwargs"):
+        policy.act(obs)
 
 
 def test_it_says_what_it_was_trained_for(policy):
@@ -102,6 +113,13 @@ def test_it_says_what_it_was_trained_for(policy):
         policy.require_match(catalog.get(TASK), robot)
     with pytest.raises(MismatchError, match="expected 'NaoTouchButtonMulti-v1'"):
         policy.require_match(catalog.get("NaoTouchButtonMulti-v1"))
+
+
+def test_a_path_is_a_path(tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run.safetensors").touch()
+    shutil.copy(shipped("NaoInstruct-v1"), tmp_path / "run" / "best.safetensors")
+    assert ir_maniskill.load_policy(tmp_path / "run").env_id == "NaoInstruct-v1"
 
 
 def test_what_cannot_be_loaded_says_what_can(tmp_path):

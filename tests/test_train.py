@@ -366,16 +366,19 @@ def test_words_in_other_places_are_refused(tmp_path, before):
         run(toy_config(tmp_path / "new", init_from=str(before)), envs=envs)
 
 
-def test_a_resumed_run_does_not_begin_again(tmp_path, before, interrupt):
+@pytest.mark.parametrize("update", [1, 3])
+def test_a_resumed_run_does_not_begin_again(tmp_path, before, interrupt, update):
     config = toy_config(tmp_path / "whole", init_from=str(before))
     run(config)
     halves = dataclasses.replace(config, out=str(tmp_path / "halves"))
-    interrupt(3)
+    interrupt(update)
     with pytest.raises(KeyboardInterrupt):
         run(halves)
     shutil.rmtree(before)
     run(halves, resume=True)
     assert_same(tensors(tmp_path / "whole"), tensors(tmp_path / "halves"))
+    whole, made = (rows(tmp_path / n, "evaluations") for n in ("whole", "halves"))
+    assert made == whole
 
 
 def test_what_the_weights_need_comes_with_them_unless_it_is_told(before):

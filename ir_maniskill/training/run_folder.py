@@ -92,8 +92,10 @@ class RunFolder:
         self._events = SummaryWriter(str(self.path), purge_step=steps + 1)
         self.write("config.json", (to_json(config) + "\n").encode())
         self._cut("metrics", steps)
-        # Without the best policy the last evaluation is made again, to have one.
-        return self._cut("evaluations", steps - (not self.best.exists()))
+        # The evaluation of what a run begins with is made again, and without the best
+        # policy the last one is, to have one.
+        again = steps == 0 or not self.best.exists()
+        return self._cut("evaluations", steps - again)
 
     def _cut(self, name: str, steps: int) -> int:
         """Drop the rows after `steps` of a table; return the steps of the last kept."""
