@@ -106,7 +106,7 @@ def audit(
     Returns:
         The table: `print` shows it, `evaluation.plots.bars` draws it.
     """
-    require(num_envs >= 2, "num_envs", num_envs, "at least 2")
+    require_whole("num_envs", num_envs, 2)
     if isinstance(policy, Policy | str | Path):
         robot = env_kwargs.get("robot_uids")
         policy, experiment, _ = _prepare(

@@ -174,12 +174,15 @@ def test_anybodys_function_is_audited_on_what_envs_observe(monkeypatch):
         def reset(self, done):
             self.begun = done
 
+    with pytest.raises(ValueError, match="episodes: got 1.5, expected a whole number"):
+        ir_maniskill.audit(Mine(), TASK.id, episodes=1.5)
     monkeypatch.setattr(audits, "audit", fake)
     ir_maniskill.audit(Mine(), TASK.id, episodes=5)
     assert asked["action"].tolist() == [[2]] and asked["task"] == TASK.id
     assert asked["made"]["obs_mode"] == "state"
-    with pytest.raises(ValueError, match="num_envs: got 1, expected at least 2"):
-        ir_maniskill.audit(Mine(), TASK.id, num_envs=1)
+    for wrong in (1, "2"):
+        with pytest.raises(ValueError, match=f"num_envs: got {wrong!r}, .* at least 2"):
+            ir_maniskill.audit(Mine(), TASK.id, num_envs=wrong)
     with pytest.raises(ValueError, match="policy: got .*, expected a function"):
         ir_maniskill.audit(audits, TASK.id)
 

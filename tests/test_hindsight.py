@@ -106,6 +106,11 @@ def test_spoken_sentences_are_read_as_they_are_and_loosely() -> None:
     assert all("green" in text and "left hand" in text for text in said)
 
 
+def test_the_goal_of_a_sentence_written_by_hand_is_known() -> None:
+    hindsight = Hindsight.of(dataclasses.replace(LISTEN, env_id="NaoInstruct-v1"), 4)
+    assert hindsight.said("toch the blu cube").goal == Touch(Ref("blue", "cube"))
+
+
 def test_sentences_that_came_true_are_preferred() -> None:
     torch.manual_seed(0)
     hindsight = Hindsight.of(dataclasses.replace(LISTEN, env_id="NaoInstruct-v1"), 4)

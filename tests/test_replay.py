@@ -1,6 +1,9 @@
+from types import SimpleNamespace
+
 import pytest
 import torch
 
+from ir_maniskill.training import replay as module
 from ir_maniskill.training.replay import Replay
 
 
@@ -95,6 +98,16 @@ def test_if_all_rows_are_later_than_the_checkpoint_it_begins_anew(tmp_path) -> N
     assert len(second) == 0
     second.add(episode(30, 4))
     assert set(second.read("number", second.draw(99)).tolist()) == {30, 31, 32}
+
+
+def test_a_disk_that_is_full_is_an_error(tmp_path, monkeypatch) -> None:
+    free = SimpleNamespace(free=1000)
+    monkeypatch.setattr(module, "disk_usage", lambda folder: free)
+    replay = Replay(100)  # of 48 bytes a row
+    replay.keep_in(tmp_path)
+    replay.add(episode(0, 10))
+    with pytest.raises(OSError, match="cannot write .*No space left on device"):
+        replay.add(episode(0, 11))
 
 
 def test_rows_of_another_layout_are_refused(tmp_path) -> None:

@@ -11,7 +11,7 @@ from ir_maniskill.checks import ConfigError
 from ir_maniskill.environment import senses
 from ir_maniskill.environment.reward_generator import RewardWeights
 from ir_maniskill.environment.senses import StateStack
-from ir_maniskill.training import checkpoint
+from ir_maniskill.training import checkpoint, runner
 from ir_maniskill.training.algorithm import Outcome
 from ir_maniskill.training.hindsight import Hindsight
 from ir_maniskill.training.runner import Runner
@@ -30,12 +30,12 @@ class Judged(SAC):
         super().__init__(config, state, actions, hindsight=hindsight())
 
 
-def learn(out, steps, **changes):
+def learn(out, steps, resume=False, **changes):
     """Train on the toy task; return the file of the best policy."""
     envs = ToyVectorEnv(snapshots=True)
     config = toy_sac(out, total_steps=steps, **changes)
     evaluated_in = ToyVectorEnv(snapshots=True)
-    return run(config, envs=envs, eval_envs=evaluated_in, algorithm=Judged)
+    return run(config, resume, envs, evaluated_in, Judged)
 
 
 # -- Parts -----------------------------------------------------------------------------
@@ -213,23 +213,27 @@ def test_every_episode_is_kept_whole(tmp_path) -> None:
     torch.testing.assert_close((joints + 0.3 * actions).clamp(-1, 1), after)
 
 
-def test_a_resumed_run_goes_on_with_the_replay_of_the_first(tmp_path) -> None:
-    out = tmp_path / "run"
-    learn(out, 1000, checkpoint_interval=10_000)
-    stored = checkpoint.read(out / "last.safetensors")
-    written, episodes = stored.tensors["replay.written"].tolist()
-    assert written > 900
-    envs = ToyVectorEnv(snapshots=True)
-    algorithm = collected(out, envs, episodes=1)
-    algorithm.keep_in(out)
-    algorithm.replay = type(algorithm.replay)(2000)
-    algorithm.keep_in(out)
-    algorithm.load_state_dict(stored.tensors)
-    assert (algorithm.replay.written, algorithm.replay.episodes) == (written, episodes)
-    again = algorithm.state_dict()
-    assert again.keys() <= stored.tensors.keys()
-    for name, tensor in again.items():
-        torch.testing.assert_close(tensor, stored.tensors[name])
+def test_a_resumed_run_equals_one_never_interrupted(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(runner, "FINAL_EPISODES", 8)
+    learner = dataclasses.replace(toy_sac(tmp_path).sac, policy_from=0.8)
+    config = {"checkpoint_interval": 600, "sac": learner}
+    learn(tmp_path / "whole", 1000, **config)
+    save = Runner.save
+
+    def save_and_stop(self):
+        save(self)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Runner, "save", save_and_stop)
+        learn(tmp_path / "halves", 1000, **config)
+    torch.manual_seed(123)  # whatever happens in between
+    learn(tmp_path / "halves", 1000, resume=True, **config)
+    whole, halves = (
+        checkpoint.read(tmp_path / name / "last.safetensors").tensors
+        for name in ("whole", "halves")
+    )
+    assert [name for name in whole if not torch.equal(whole[name], halves[name])] == []
 
 
 def test_the_first_value_of_a_discounted_reward_is_the_reward(tmp_path) -> None:

@@ -21,7 +21,7 @@ from gymnasium.spaces import Dict
 from torch import Tensor
 from tqdm import tqdm
 
-from ir_maniskill.checks import require
+from ir_maniskill.checks import require, require_whole
 from ir_maniskill.environment.layout import layout_of
 from ir_maniskill.environment.robots import Nao
 from ir_maniskill.environment.senses import (
@@ -135,7 +135,7 @@ def audit(
     Raises:
         ValueError: There are no episodes.
     """
-    require(episodes >= 1, "episodes", episodes, "at least 1")
+    require_whole("episodes", episodes, 1)
     if episodes < FEW:
         log.warning("%d episodes: intervals are wide, take at least %d", episodes, FEW)
     found = _all_rows(player, task, make, episodes, seed)

@@ -26,7 +26,7 @@ from ir_maniskill.environment.senses import read_text, text_of, tokens_of
 from ir_maniskill.environment.speaker import Speaker
 from ir_maniskill.experiment import Experiment, Spoken
 from ir_maniskill.goals import SHAPES, Goal, Instruction, Measure
-from ir_maniskill.language import loosely, parse, things
+from ir_maniskill.language import handwritten, loosely, parse, things
 from ir_maniskill.snapshot import Snapshot
 from ir_maniskill.training.config import TrainConfig
 
@@ -139,7 +139,8 @@ class Hindsight:
 
     def said(self, text: str) -> Instruction:
         """Return the instruction of a sentence."""
-        known = {instruction.text: instruction for instruction in self._listed}
+        listed = self._listed or handwritten()  # of which some cannot be read
+        known = {instruction.text: instruction for instruction in listed}
         return known.get(text) or Instruction(text, parse(text))
 
     def read(

@@ -6,12 +6,17 @@ oldest rows make room for the newest. Legend: N rows, S stacked observations.
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Mapping
 from pathlib import Path
+from shutil import disk_usage
 
 import torch
 from numpy.lib.format import open_memmap
 from torch import Tensor
+
+from ir_maniskill.files import writing
 
 Rows = dict[str, Tensor]
 """Tensors by name [N, ...]."""
@@ -51,6 +56,7 @@ class Replay:
         """Add the T + 1 rows of an episode.
 
         Raises:
+            OSError: The disk is full.
             ValueError: It is longer than the replay.
         """
         count = len(next(iter(episode.values())))
@@ -59,6 +65,7 @@ class Replay:
                 f"replay: got an episode of {count} rows, room for {self.capacity}"
             )
         self._make_room(episode)
+        self._require_space(2 * count * self.bytes // self.capacity)
         where = (self.written + torch.arange(count)) % self.capacity
         # Were the process killed here, these rows would belong to no episode.
         self._rows[EPISODE][where] = -1
@@ -79,6 +86,13 @@ class Replay:
             empty = rows.new_zeros(1).expand(self.capacity, *rows.shape[1:])
             self._rows[name] = self._kept(name, empty)
         self._rows[EPISODE].fill_(-1)
+
+    def _require_space(self, size: int) -> None:
+        """Raise OSError if the disk has less: mapped files would kill the process."""
+        if self._folder is None or disk_usage(self._folder).free >= size:
+            return
+        with writing(self._folder):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def _kept(self, name: str, rows: Tensor) -> Tensor:
         """Return room for such rows, which are all 0: in memory, or in a new file."""
