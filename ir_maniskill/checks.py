@@ -58,7 +58,7 @@ def require_fields(
 
 
 def require_types(config: object) -> None:
-    """Raise ConfigError unless each field has a value of the type that it is to have."""
+    """Raise ConfigError unless each field has a value of its type."""
     for name, hint in typing.get_type_hints(type(config)).items():
         expected = f"a value of type {hint.__name__ if type(hint) is type else hint}"
         if typing.get_origin(hint) is Literal:

@@ -8,14 +8,14 @@ from toy_envs import SPEC, toy_config, toy_state
 
 from ir_maniskill.agent import Agent
 from ir_maniskill.agent.agent import Act, Judgement
-from ir_maniskill.environment.reward_generator import TERMS, RewardWeights
+from ir_maniskill.environment.reward_generator import TERMS
 from ir_maniskill.environment.senses import StateStack
 from ir_maniskill.training import ppo
 from ir_maniskill.training.algorithm import Outcome
 from ir_maniskill.training.config import PPOConfig, TrainConfig
 from ir_maniskill.training.finite import TrainingDivergedError, check_finite
 from ir_maniskill.training.rollout import Batch, RewardScale, Rollout, advantages
-from ir_maniskill.training.schedules import Curriculum, linear
+from ir_maniskill.training.schedules import linear
 
 
 def column(*values):
@@ -171,7 +171,7 @@ def test_a_schedule_changes_up_to_a_share_and_stays_then():
     shares = (0.0, 0.25, 0.5, 0.75, 1.0)
     got = [linear(2.0, 4.0, share, end_share=0.5) for share in shares]
     assert got == [2, 3, 4, 4, 4]
-    assert Curriculum(RewardWeights(), warmup=0.0).at(0.0) == RewardWeights()
+    assert linear(2.0, 4.0, 0.0, end_share=0.0) == 4
 
 
 @pytest.mark.parametrize(("num_envs", "steps"), [(16, 128), (24, 86), (1024, 2)])

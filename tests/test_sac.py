@@ -19,15 +19,10 @@ from ir_maniskill.training.sac import SAC, Critics
 from ir_maniskill.training.train import run
 
 
-def hindsight(others=1):
-    return Hindsight(TASK, HANDS, RewardWeights().vector(), others)
-
-
-class Judged(SAC):
-    """It judges the toy task."""
-
-    def __init__(self, config, state, actions):
-        super().__init__(config, state, actions, hindsight=hindsight())
+@pytest.fixture(autouse=True)
+def of_the_toy_task(monkeypatch):
+    judge = Hindsight(TASK, HANDS, RewardWeights().vector(), others=1)
+    monkeypatch.setattr(Hindsight, "of", lambda *_: judge)
 
 
 def learn(out, steps, resume=False, **changes):
@@ -35,7 +30,7 @@ def learn(out, steps, resume=False, **changes):
     envs = ToyVectorEnv(snapshots=True)
     config = toy_sac(out, total_steps=steps, **changes)
     evaluated_in = ToyVectorEnv(snapshots=True)
-    return run(config, resume, envs, evaluated_in, Judged)
+    return run(config, resume, envs, evaluated_in)
 
 
 # -- Parts -----------------------------------------------------------------------------
@@ -119,7 +114,7 @@ def collected(tmp_path, envs, episodes=4, **changes):
     stack = StateStack(1)
     state = stack.reset(envs.reset(seed=0)[0])
     config = toy_sac(tmp_path, **changes)
-    algorithm = Judged(config, state, 2)
+    algorithm = SAC(config, state, 2)
     for _ in range(episodes * LENGTH):
         action = algorithm.act(state)
         obs, reward, terminated, truncated, info = envs.step(action)

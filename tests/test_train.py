@@ -421,7 +421,7 @@ def test_a_folder_with_a_run_is_not_overwritten(tmp_path):
 @pytest.mark.parametrize(
     ("envs", "message"),
     [
-        (ToyVectorEnv(4), "num_envs: got a vector of 4 envs, expected 8"),
+        (ToyVectorEnv(4), "num_envs of those given: got 4, expected 8"),
         (ToyVectorEnv(8, env_id="B-v1"), "env_id: got 'Toy-v1', expected 'B-v1'"),
     ],
 )

@@ -189,12 +189,10 @@ class Agent(nn.Module):
     def _make_critic(self, config: AgentConfig, spec: StateSpec) -> None:
         senses = config.senses or ()
         if config.critic == "asymmetric":
-            if "privileged" not in spec.shapes:
-                raise ValueError(
-                    "the asymmetric critic reads the simulator's state, but the "
-                    "observation has none; got an obs_mode without it, expected "
-                    "'rgb+state_dict' or 'state_dict'"
-                )
+            expected = "the simulator's state, which the asymmetric critic reads: make "
+            expected += "the env with obs_mode 'rgb+state_dict' or 'state_dict'"
+            found = tuple(spec.shapes)
+            require("privileged" in found, "observation", found, expected)
             # All that is felt; of the actor's senses only pictures are left out, which
             # the state stands for.
             every = ("proprioception", "target", "touch", "state", *senses)

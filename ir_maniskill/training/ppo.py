@@ -22,7 +22,7 @@ from ir_maniskill.training.config import PPOConfig, TrainConfig
 from ir_maniskill.training.finite import check_finite
 from ir_maniskill.training.gradient import Loss, backward
 from ir_maniskill.training.rollout import Batch, RewardScale, Rollout
-from ir_maniskill.training.schedules import Curriculum, linear
+from ir_maniskill.training.schedules import linear, softened
 
 VALUE_WEIGHT = 0.5
 """Weight of the critic's loss."""
@@ -54,7 +54,7 @@ class PPO(Algorithm):
         self.optimizer = torch.optim.Adam(weights, rate, eps=1e-5, fused=True)
         self.rollout = Rollout(config.steps_per_env, state, actions)
         self.reward_scale = RewardScale(self.rollout.num_envs, config.ppo.gamma)
-        self.curriculum = Curriculum(config.reward_weights, config.penalty_warmup)
+        self._in_full, self._warmup = config.reward_weights, config.penalty_warmup
         self._t = 0  # steps of the present roll-out
 
     @torch.no_grad()
@@ -70,8 +70,8 @@ class PPO(Algorithm):
         """Begin a roll-out: schedules take their values for all of it."""
         std, final = self.config.std, self.config.std_final
         self.agent.actor.set_std(linear(std, final, self.share))
-        self._weights = self.curriculum.at(self.share).vector()
-        self._penalty = self.curriculum.penalty(self.share)
+        self._penalty = linear(0.0, 1.0, self.share, self._warmup)
+        self._weights = softened(self._in_full, self._penalty).vector()
         self.rollout.begin(state)
 
     @torch.no_grad()

@@ -60,6 +60,8 @@ LOGGED = 64
 """Updates from one row of the log to the next."""
 WIDTHS = (384, 384)
 """Units of each critic's layers."""
+PARTS = ("agent", "critics", "slow", "teacher", "replay")
+"""What of the algorithm is in a checkpoint, beside optimizers and numbers."""
 
 
 def in_16_bits() -> torch.autocast:
@@ -117,16 +119,8 @@ class SAC(Algorithm):
         """Return the CPU: the replay is in files, and the networks are small."""
         return torch.device("cpu")
 
-    def __init__(
-        self,
-        config: TrainConfig,
-        state: State,
-        actions: int,
-        hindsight: Hindsight | None = None,
-    ) -> None:
+    def __init__(self, config: TrainConfig, state: State, actions: int) -> None:
         """Make an untrained agent.
-
-        `hindsight` judges the episodes; None: that of the config's task.
 
         Raises:
             ConfigError: The agent or the number of processes does not fit.
@@ -134,7 +128,7 @@ class SAC(Algorithm):
         self.config: SACConfig = config.sac
         ranks = distributed.size()
         require(ranks == 1, "processes", ranks, "1: SAC trains in a single one")
-        self.hindsight = hindsight or Hindsight.of(config, config.sac.others)
+        self.hindsight = Hindsight.of(config, config.sac.others)
         rows = 2 * config.num_envs * self.hindsight.experiment.episode_steps
         expected = f"at least {rows}: episodes that a checkpoint cuts short are lost"
         every = config.checkpoint_interval
@@ -277,12 +271,10 @@ class SAC(Algorithm):
         if self.updates % LOGGED:
             return {}
         history = sorted(self._history.items())  # a table's columns keep their order
-        figures = {k: float(torch.stack(v).mean()) for k, v in history}
+        means = {name: torch.stack(values).mean() for name, values in history}
         self._history.clear()
-        check_finite(
-            {k: torch.tensor(v) for k, v in figures.items()},
-            *("loss", "the learning rate is too high"),
-        )
+        check_finite(means, "loss", "the learning rate is too high")
+        figures = {name: float(mean) for name, mean in means.items()}
         return figures | {"replay": float(len(self.replay))}
 
     def _draw(self) -> State:
@@ -455,28 +447,16 @@ class SAC(Algorithm):
         """Return all weights, the optimizers' averages, and how full the replay is."""
         tensors = {"temperature": self.log_temperature.detach().clone()}
         tensors["updates"] = torch.tensor(self.updates)
-        for name, part in self._parts().items():
-            tensors |= copied(name, part)
+        for name in PARTS:
+            tensors |= copied(name, getattr(self, name).state_dict())
         for name, optimizer in self._optimizers.items():
             tensors |= copied(f"optimizer.{name}", averages(optimizer))
         return tensors
 
-    def _parts(self) -> dict[str, Mapping[str, Tensor]]:
-        return {
-            "agent": self.agent.state_dict(),
-            "critics": self.critics.state_dict(),
-            "slow": self.slow.state_dict(),
-            "teacher": self.teacher.state_dict(),
-            "replay": self.replay.state_dict(),
-        }
-
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
         """Go on from what `state_dict` returned."""
-        self.agent.load_state_dict(under("agent", tensors))
-        self.critics.load_state_dict(under("critics", tensors))
-        self.slow.load_state_dict(under("slow", tensors))
-        self.teacher.load_state_dict(under("teacher", tensors))
-        self.replay.load_state_dict(under("replay", tensors))
+        for name in PARTS:
+            getattr(self, name).load_state_dict(under(name, tensors))
         for name, optimizer in self._optimizers.items():
             load_averages(optimizer, under(f"optimizer.{name}", tensors))
         with torch.no_grad():

@@ -14,7 +14,7 @@ import torch
 from ir_maniskill import experiment as catalog
 from ir_maniskill.agent.agent import Agent
 from ir_maniskill.agent.language_system import encoder_of
-from ir_maniskill.checks import ConfigError, require, require_choice
+from ir_maniskill.checks import require, require_choice
 from ir_maniskill.environment.vector import VectorEnv, make_vec
 from ir_maniskill.experiment import Experiment
 from ir_maniskill.policy import load_policy
@@ -196,11 +196,8 @@ def _require_fit(config: TrainConfig, envs: VectorEnv) -> None:
     task, share = envs.experiment.id, config.num_envs // distributed.size()
     expected = f"{task!r}, the task of the envs given"
     require(config.env_id == task, "env_id", config.env_id, expected)
-    if envs.num_envs != share:
-        raise ConfigError(
-            f"num_envs: got a vector of {envs.num_envs} envs, expected {share}, which "
-            f"is this rank's share of {config.num_envs}; change one of them"
-        )
+    expected = f"{share}, this rank's share of {config.num_envs}"
+    require(envs.num_envs == share, "num_envs of those given", envs.num_envs, expected)
     episodes, sentences = config.eval_episodes, len(envs.experiment.sentences)
     expected = f"at least {sentences}, one for each sentence"
     require(episodes >= sentences, "eval_episodes", episodes, expected)
