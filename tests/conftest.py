@@ -17,6 +17,7 @@ from hypothesis import settings
 
 import ir_maniskill
 from ir_maniskill.environment.process_vector import ProcessVectorEnv
+from ir_maniskill.training import ppo
 
 settings.register_profile("busy machines", deadline=None)
 settings.load_profile("busy machines")
@@ -67,3 +68,21 @@ def reflex() -> Any:
         return torch.tanh(felt @ weights + seen[:, None])
 
     return policy
+
+
+@pytest.fixture
+def before_update(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Do something before the gradients of the n-th update of PPO."""
+
+    def arrange(count, action):
+        improve, calls = ppo.improve, []
+
+        def patched(*arguments):
+            calls.append(None)
+            if len(calls) == count:
+                action()
+            return improve(*arguments)
+
+        monkeypatch.setattr(ppo, "improve", patched)
+
+    return arrange

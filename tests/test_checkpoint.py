@@ -2,7 +2,6 @@ import dataclasses
 import json
 import math
 import os
-import pickle
 import random
 import re
 import resource
@@ -39,12 +38,6 @@ def trained(tmp_path):
     (judgement.log_prob.sum() + judgement.value.sum()).backward()
     optimizer.step()
     return agent, optimizer, config
-
-
-def packed_of(agent, optimizer):
-    """Return the tensors of a checkpoint."""
-    weights = copied("agent", agent.state_dict())
-    return weights | copied("optimizer", averages(optimizer))
 
 
 def test_random_generators_go_on_where_they_were():
@@ -110,7 +103,8 @@ def write_both(folder, agent, optimizer, config):
     paths = folder / "policy", folder / "checkpoint"
     checkpoint.save_policy(paths[0], agent, config, steps=1, evaluation={})
     facts = checkpoint.describe(agent, config, steps=1)
-    packed = packed_of(agent, optimizer)
+    packed = copied("agent", agent.state_dict())
+    packed |= copied("optimizer", averages(optimizer))
     checkpoint.write(paths[1], Stored(checkpoint.CHECKPOINT, packed, facts))
     return paths
 
@@ -190,7 +184,6 @@ def test_files_of_wrong_values_work_or_get_the_error(trained, tmp_path):
     [
         b"",
         b"\x02" + b"\0" * 7,
-        pickle.dumps({"agent": 1}),
         safetensors.torch.save({"weight": torch.zeros(2)}),
         safetensors.torch.save({"weight": torch.zeros(2)}, {"kind": "another"}),
     ],

@@ -18,7 +18,7 @@ from toy_envs import LENGTH, ToyVectorEnv, toy_config
 
 from ir_maniskill.environment.process_vector import WorkerError
 from ir_maniskill.environment.vector import make_vec
-from ir_maniskill.training import checkpoint, ppo, run_folder, runner
+from ir_maniskill.training import checkpoint, run_folder, runner
 from ir_maniskill.training.checkpoint import CheckpointError
 from ir_maniskill.training.config import AgentConfig, PPOConfig, TrainConfig
 from ir_maniskill.training.run_folder import RunFolder
@@ -34,24 +34,6 @@ def steps_of(table):
 
 def saved(folder):
     return checkpoint.read(folder / "last.safetensors")
-
-
-@pytest.fixture
-def before_update(monkeypatch):
-    """Do something before the gradients of the n-th update."""
-
-    def arrange(count, action):
-        improve, calls = ppo.improve, []
-
-        def patched(*arguments):
-            calls.append(None)
-            if len(calls) == count:
-                action()
-            return improve(*arguments)
-
-        monkeypatch.setattr(ppo, "improve", patched)
-
-    return arrange
 
 
 # -- Killed ----------------------------------------------------------------------------

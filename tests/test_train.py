@@ -15,7 +15,7 @@ from toy_envs import LENGTH, SENTENCES, ToyVectorEnv, toy_config
 from ir_maniskill.environment.vector import info_of_step
 from ir_maniskill.evaluation.evaluate import EvaluationReport, Rate, Score
 from ir_maniskill.language.tokens import VOCABULARY
-from ir_maniskill.training import checkpoint, distributed, ppo, run_folder, runner
+from ir_maniskill.training import checkpoint, distributed, run_folder, runner
 from ir_maniskill.training import train as training
 from ir_maniskill.training.algorithm import under
 from ir_maniskill.training.checkpoint import CheckpointError, MismatchError
@@ -59,21 +59,13 @@ def assert_same(first, second):
 
 
 @pytest.fixture
-def interrupt(monkeypatch):
+def interrupt(before_update):
     """Make the training stop in its n-th update, as if by Ctrl-C."""
 
-    def at(count, error=KeyboardInterrupt):
-        improve, calls = ppo.improve, []
+    def stop(error):
+        raise error
 
-        def interrupted(*arguments):
-            calls.append(None)
-            if len(calls) == count:
-                raise error
-            return improve(*arguments)
-
-        monkeypatch.setattr(ppo, "improve", interrupted)
-
-    return at
+    return lambda at, error=KeyboardInterrupt: before_update(at, lambda: stop(error))
 
 
 def test_training_learns_the_toy_task_and_keeps_the_best_policy(tmp_path):

@@ -179,7 +179,6 @@ def toy_sac(out, **changes):
     )
     learner = SACConfig(capacity=2000, random_steps=128, batch=64, policy_from=0.2)
     values = {"algorithm": "sac", "frames": 1, "agent": agent, "sac": learner}
-    values |= {"ppo": PPOConfig(), "penalty_warmup": 0.0}
     return toy_config(out, **(values | changes))
 
 

@@ -200,11 +200,10 @@ class Agent(nn.Module):
         self.critic_encoder = StateEncoder(config, spec, senses)
         self.critic = Critic(self.critic_encoder.width, config.hidden)
 
-    def act(self, state: State, deterministic: bool = False) -> Act:
-        """Return an action for each state: sampled, or the policy's mean."""
-        aligned = self.encoder(state)
-        policy = self._distribution(state, aligned)
-        action = policy.mean if deterministic else policy.sample()
+    def act(self, state: State) -> Act:
+        """Return an action for each state, sampled."""
+        policy = self._distribution(state, self.encoder(state))
+        action = policy.sample()
         log_prob = policy.log_prob(action).sum(-1)
         return Act(action, log_prob, self.value(state))
 
