@@ -1,4 +1,3 @@
-import csv
 import dataclasses
 import multiprocessing as mp
 import os
@@ -11,7 +10,15 @@ from pathlib import Path
 import pytest
 import torch
 from torch.nn.utils import parameters_to_vector
-from toy_envs import LENGTH, SPEC, ToyVectorEnv, toy_config, toy_state
+from toy_envs import (
+    LENGTH,
+    SPEC,
+    ToyVectorEnv,
+    records,
+    steps_of,
+    toy_config,
+    toy_state,
+)
 
 from ir_maniskill.agent import Agent
 from ir_maniskill.training import checkpoint, distributed, ppo, runner
@@ -257,20 +264,13 @@ def test_a_run_of_two_ranks_resumes_bit_for_bit(trained):
     )
     same = [name for name in whole if not name.startswith("random.numpy")]
     assert [name for name in same if not torch.equal(whole[name], halves[name])] == []
-    assert metrics(trained / "whole") == metrics(trained / "halves")
+    assert records(trained / "whole") == records(trained / "halves")
 
 
 @pytest.mark.slow
 def test_one_set_of_records_counts_all_ranks(trained):
-    steps = [int(row["steps"]) for row in metrics(trained / "whole")]
-    assert steps == [UPDATE * i for i in (1, 2, 3, 4)]
+    assert steps_of(trained / "whole") == [UPDATE * i for i in (1, 2, 3, 4)]
     assert (trained / "whole" / "evaluation.json").exists()
-
-
-def metrics(folder):
-    with (folder / "metrics.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    return [{k: v for k, v in row.items() if "time" not in k} for row in rows]
 
 
 # -- Failures --------------------------------------------------------------------------
@@ -335,4 +335,4 @@ def test_torchrun_trains_on_the_real_task(tmp_path):
     done = subprocess.run([*torchrun, *train], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("The best policy is in") == 1
-    assert [row["steps"] for row in metrics(tmp_path)] == ["128", "256"]
+    assert steps_of(tmp_path) == [128, 256]

@@ -186,24 +186,6 @@ def test_whatever_a_field_is_set_to_it_works_or_is_refused(
         InstructionalSet(made, HANDS, torch.device("cpu"))
 
 
-@given(st.lists(st.tuples(st.text(), st.booleans()), min_size=1, max_size=4))
-def test_accepted_sentences_have_tokens_that_say_which_goal(
-    said: list[tuple[str, bool]],
-) -> None:
-    orders = tuple(Instruction(t, Touch(Ref("blue" if b else "red"))) for t, b in said)
-    try:
-        experiment = make(instructions=orders, vocabulary=VOCABULARY)
-    except ExperimentError:
-        return
-    made = InstructionalSet(experiment, HANDS, torch.device("cpu"))
-    tokens = made.tokens[: len(made)]
-    assert (tokens[:, 0] > 0).all()
-    rows = list(map(tuple, tokens.tolist()))
-    meanings = dict(zip(rows, orders, strict=True))
-    for row, order in zip(rows, orders, strict=True):
-        assert meanings[row].goal == order.goal
-
-
 @pytest.mark.parametrize(("text", "goal"), [(3, SOUND), ("Go.", "red cube")])
 def test_instructions_of_other_types_are_refused(text: object, goal: object) -> None:
     with pytest.raises(GoalError, match="got (3|'red cube'), expected a (str|G)"):

@@ -1,5 +1,4 @@
 import contextlib
-import csv
 import dataclasses
 import itertools
 import json
@@ -10,7 +9,14 @@ import shutil
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from toy_envs import LENGTH, SENTENCES, ToyVectorEnv, toy_config
+from toy_envs import (
+    LENGTH,
+    SENTENCES,
+    ToyVectorEnv,
+    records,
+    steps_of,
+    toy_config,
+)
 
 from ir_maniskill.environment.vector import info_of_step
 from ir_maniskill.evaluation.evaluate import EvaluationReport, Rate, Score
@@ -43,11 +49,6 @@ def run(config, **kwargs):
     return train(config, **(given | kwargs))
 
 
-def rows(folder, table):
-    with (folder / f"{table}.csv").open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def tensors(folder):
     return checkpoint.read(folder / "last.safetensors").tensors
 
@@ -74,7 +75,7 @@ def test_training_learns_the_toy_task_and_keeps_the_best_policy(tmp_path):
     config = toy_config(tmp_path, ppo=learner, **steps)
     best = run(config)
     assert best == tmp_path / "best.safetensors"
-    assert float(rows(tmp_path, "evaluations")[-1]["eval/worst"]) == 1.0
+    assert float(records(tmp_path, "evaluations")[-1]["eval/worst"]) == 1.0
     report = json.loads((tmp_path / "evaluation.json").read_text())
     assert (report["episodes"], report["overall"]["success"]) == (16, 1.0)
     _, stored, metadata = checkpoint.load_agent(best)
@@ -120,19 +121,14 @@ def test_a_run_resumed_at_a_checkpoint_equals_one_never_interrupted(
     torch.manual_seed(123)  # whatever happens in between
     go(config("halves"), resume=True)
     assert_same(tensors(tmp_path / "whole"), tensors(tmp_path / "halves"))
-    times = ("time/collect", "time/update")
-    first, second = (
-        [{k: v for k, v in row.items() if k not in times} for row in records]
-        for records in (rows(tmp_path / n, "metrics") for n in ("whole", "halves"))
-    )
-    assert first == second
+    assert records(tmp_path / "whole") == records(tmp_path / "halves")
 
 
 def test_an_evaluation_alone_changes_nothing(tmp_path):
     never = {"checkpoint_interval": 10**6}
     run(toy_config(tmp_path / "never", **never))
     run(toy_config(tmp_path / "often", eval_interval=UPDATE, **never))
-    assert len(rows(tmp_path / "often", "evaluations")) == 4
+    assert len(records(tmp_path / "often", "evaluations")) == 4
     assert_same(tensors(tmp_path / "never"), tensors(tmp_path / "often"))
 
 
@@ -187,7 +183,7 @@ def test_an_evaluation_that_is_interrupted_is_made_on_resuming(
     assert next(calls) > 2
     whole, parts = (
         (
-            rows(folder, "evaluations"),
+            records(folder, "evaluations"),
             checkpoint.read(folder / "last.safetensors").metadata["best_score"],
             (folder / "evaluation.json").read_text(),
         )
@@ -213,12 +209,11 @@ def test_records_have_no_steps_made_again(tmp_path, interrupt):
     interrupt(4, TrainingDivergedError)  # leaves the checkpoint of the second update
     with pytest.raises(TrainingDivergedError):
         run(toy_config(tmp_path))
-    assert [int(row["steps"]) for row in rows(tmp_path, "metrics")][-1] == 3 * UPDATE
+    assert steps_of(tmp_path)[-1] == 3 * UPDATE
     run(toy_config(tmp_path), resume=True)
     events = EventAccumulator(str(tmp_path)).Reload()
     curve = [point.step for point in events.Scalars("train/reward")]
-    steps = [int(row["steps"]) for row in rows(tmp_path, "metrics")]
-    assert curve == steps == [UPDATE * i for i in (1, 2, 3, 4)]
+    assert curve == steps_of(tmp_path) == [UPDATE * i for i in (1, 2, 3, 4)]
 
 
 @pytest.mark.parametrize("updates", [2, 4])  # of 4: in the middle, and at the end
@@ -229,8 +224,7 @@ def test_a_run_whose_best_policy_is_lost_gets_another(tmp_path, updates):
     run(config, resume=True)
     best = checkpoint.read(tmp_path / "best.safetensors").metadata
     assert best["steps"] in (2 * UPDATE, 4 * UPDATE)
-    steps = [int(row["steps"]) for row in rows(tmp_path, "evaluations")]
-    assert steps == [2 * UPDATE, 4 * UPDATE]
+    assert steps_of(tmp_path, "evaluations") == [2 * UPDATE, 4 * UPDATE]
 
 
 def test_a_best_policy_that_is_broken_is_refused_before_training(tmp_path, interrupt):
@@ -369,7 +363,7 @@ def test_a_resumed_run_does_not_begin_again(tmp_path, before, interrupt, update)
     shutil.rmtree(before)
     run(halves, resume=True)
     assert_same(tensors(tmp_path / "whole"), tensors(tmp_path / "halves"))
-    whole, made = (rows(tmp_path / n, "evaluations") for n in ("whole", "halves"))
+    whole, made = (records(tmp_path / n, "evaluations") for n in ("whole", "halves"))
     assert made == whole
 
 
@@ -498,7 +492,7 @@ def test_noise_and_penalties_follow_the_share_of_the_steps(tmp_path):
     config = toy_config(tmp_path, penalty_warmup=0.5)
     learner = dataclasses.replace(config.ppo, std=0.5, std_final=0.1)
     run(dataclasses.replace(config, ppo=learner))
-    got = rows(tmp_path, "metrics")
+    got = records(tmp_path)
     noise = [float(row["std"]) for row in got]
     assert noise == pytest.approx([0.5, 0.4, 0.3, 0.2], abs=1e-4)
     assert [float(row["penalty"]) for row in got] == [0, 0.5, 1, 1]
@@ -508,7 +502,7 @@ def test_every_evaluation_has_its_line_and_the_last_one_a_table(tmp_path, capsys
     run(toy_config(tmp_path, eval_interval=2 * UPDATE))
     lines = capsys.readouterr().out.splitlines()
     figures = r"success \d+%, worst sentence \d+%, exclusive .*fingers"
-    steps = [row["steps"] for row in rows(tmp_path, "evaluations")]
+    steps = steps_of(tmp_path, "evaluations")
     for line, step in zip(lines, steps, strict=False):
         assert re.fullmatch(rf"step {step}: {figures}(, the best so far)?", line)
     best = checkpoint.read(tmp_path / "best.safetensors").metadata["steps"]

@@ -1,5 +1,6 @@
 """A task small enough to be learned in seconds, for the tests of the learner."""
 
+import csv
 from types import SimpleNamespace
 
 import numpy as np
@@ -199,3 +200,15 @@ def toy_config(out, **changes):
         "ppo": ppo,
     }
     return TrainConfig(**(values | changes))
+
+
+def records(folder, table="metrics"):
+    """Return the rows of a run's table, without how long things took."""
+    with (folder / f"{table}.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    return [{k: v for k, v in row.items() if "time" not in k} for row in rows]
+
+
+def steps_of(folder, table="metrics"):
+    """Return the steps of the rows of a run's table."""
+    return [int(row["steps"]) for row in records(folder, table)]
