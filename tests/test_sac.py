@@ -71,20 +71,6 @@ def test_it_learns_to_touch_what_the_sentence_names(tmp_path) -> None:
     assert agent.locator is None, "a policy file has what only training needs"
 
 
-def test_its_policy_may_begin_with_anothers_weights(tmp_path, monkeypatch) -> None:
-    def keep(self):
-        file, agent, config = self.folder.best, self.algorithm.agent, self.config
-        checkpoint.save_policy(file, agent, config, steps=0, evaluation={})
-
-    monkeypatch.setattr(Runner, "learn", keep)
-    first = learn(tmp_path / "first", 1000)
-    begun = learn(tmp_path / "begun", 1000, seed=1, init_from=str(tmp_path / "first"))
-    fresh = learn(tmp_path / "fresh", 1000, seed=1)
-    first, begun, fresh = (checkpoint.read(f).tensors for f in (first, begun, fresh))
-    assert all(torch.equal(first[name], begun[name]) for name in first)
-    assert not any(torch.equal(v, fresh[k]) for k, v in first.items() if v.ndim > 1)
-
-
 def test_steps_are_drawn_with_the_sentence_that_they_are_judged_under(tmp_path) -> None:
     algorithm = collected(tmp_path, ToyVectorEnv(snapshots=True))
     algorithm.config = dataclasses.replace(algorithm.config, batch=600)

@@ -99,27 +99,23 @@ def test_the_best_policy_reaches_the_goal_and_holds_it_with_many_fingers():
     assert score(4, 0.5, 1.5) > score(4, 0.5, 1.0)
 
 
-@pytest.mark.parametrize("images", [False, True])
 def test_a_run_resumed_at_a_checkpoint_equals_one_never_interrupted(
-    tmp_path, interrupt, images
+    tmp_path, interrupt
 ):
-    senses = ("vision", "proprioception") if images else ("proprioception",)
-    changes = {} if not images else {"camera_height": 16, "camera_width": 8}
-    agent = AgentConfig(senses=senses, hidden=(32, 32))
+    agent = AgentConfig(senses=("vision", "proprioception"), hidden=(32, 32))
+    changes = {"agent": agent, "camera_height": 16, "camera_width": 8}
 
-    def config(name):
-        return toy_config(tmp_path / name, agent=agent, **changes)
-
-    def go(config, **kwargs):
-        envs, evaluated_in = (ToyVectorEnv(8, images=images) for _ in range(2))
+    def go(name, **kwargs):
+        envs, evaluated_in = (ToyVectorEnv(8, images=True) for _ in range(2))
+        config = toy_config(tmp_path / name, **changes)
         train(config, envs=envs, eval_envs=evaluated_in, **kwargs)
 
-    go(config("whole"))
+    go("whole")
     interrupt(3)  # after the checkpoint that follows the second update
     with pytest.raises(KeyboardInterrupt):
-        go(config("halves"))
+        go("halves")
     torch.manual_seed(123)  # whatever happens in between
-    go(config("halves"), resume=True)
+    go("halves", resume=True)
     assert_same(tensors(tmp_path / "whole"), tensors(tmp_path / "halves"))
     assert records(tmp_path / "whole") == records(tmp_path / "halves")
 
@@ -142,10 +138,9 @@ def test_the_same_seed_gives_the_same_weights_and_another_one_others(tmp_path):
     )
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError])
-def test_whatever_stops_it_the_last_complete_update_is_kept(tmp_path, interrupt, error):
-    interrupt(2, error)
-    with pytest.raises(error):
+def test_whatever_stops_it_the_last_complete_update_is_kept(tmp_path, interrupt):
+    interrupt(2, MemoryError)
+    with pytest.raises(MemoryError):
         run(toy_config(tmp_path))
     stored = checkpoint.read(tmp_path / "last.safetensors")
     assert stored.metadata["steps"] == UPDATE
