@@ -137,15 +137,8 @@ def distort(stored, generator):
     if generator.random() < 0.3:
         name = generator.choice(sorted(tensors))
         tensor = tensors.pop(name)
-        replacements = (
-            tensor.reshape(-1)[:-1],
-            tensor[None],
-            tensor.long(),
-            tensor * 0,
-        )
-        replacement = generator.choice((None, *replacements))
-        if replacement is not None:
-            tensors[generator.choice((name, "agent", "x.y"))] = replacement
+        others = tensor.reshape(-1)[:-1], tensor[None], tensor.long(), tensor * 0
+        tensors[generator.choice((name, "agent", "x.y"))] = generator.choice(others)
         return Stored(stored.kind, tensors, metadata)
     node = metadata
     while True:

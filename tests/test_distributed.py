@@ -172,11 +172,8 @@ def test_the_ranks_stop_their_epochs_together(learned):
 def test_episodes_are_counted_over_all_ranks(learned):
     first, second, _ = (got["means"] for got in learned)
     assert first == second
-    assert (first["reward"], first["return"], first["success"]) == (
-        1 / 30,
-        1 / 3,
-        2 / 3,
-    )
+    got = [first[name] for name in ("reward", "return", "success")]
+    assert got == [1 / 30, 1 / 3, 2 / 3]
 
 
 def test_minibatches_leave_the_ranks_with_the_same_weights(learned):
@@ -326,11 +323,9 @@ def test_torchrun_trains_on_the_real_task(tmp_path):
     command = Path(sys.executable).with_name("ir-maniskill")
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
     torchrun += ["--nproc-per-node", "2", "--no-python", str(command)]
-    options = "--agent.senses state --agent.hidden 16 "
-    options += (
-        "--num-envs 4 --ppo.steps-per-update 128 --ppo.minibatch 64 --ppo.epochs 1 "
-    )
-    options += "--total-steps 256 --eval-episodes 1 --out"
+    options = "--agent.senses state --agent.hidden 16 --num-envs 4 --ppo.epochs 1 "
+    options += "--ppo.steps-per-update 128 --ppo.minibatch 64 --total-steps 256 "
+    options += "--eval-episodes 1 --out"
     train = ["train", "NaoTouchCubeSingle-v1", *options.split(), str(tmp_path)]
     done = subprocess.run([*torchrun, *train], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

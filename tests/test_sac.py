@@ -74,10 +74,8 @@ def test_it_learns_to_touch_what_the_sentence_names(tmp_path) -> None:
 def test_steps_are_drawn_with_the_sentence_that_they_are_judged_under(tmp_path) -> None:
     algorithm = collected(tmp_path, ToyVectorEnv(snapshots=True))
     algorithm.config = dataclasses.replace(algorithm.config, batch=600)
-    drawn, seen = (
-        same(algorithm._draw),
-        same(lambda: algorithm._seen(*algorithm._rows())),
-    )
+    drawn = same(algorithm._draw)
+    seen = same(lambda: algorithm._seen(*algorithm._rows()))
     goal = torch.where(seen["instruction"][:, 1] == 4, -0.6, 0.6)  # token 4: "left"
     off = (drawn["next.now.proprioception"][:, 0] - goal).abs()
     near, far = off < 0.2, off > 0.5

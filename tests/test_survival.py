@@ -153,16 +153,10 @@ def leave(process, blow):
 def test_ctrl_c_and_sigterm_save_and_leave_nothing_running(tmp_path):
     task, steps = "NaoTouchCubeSingle-v1", 128
     command = [sys.executable, "-m", "ir_maniskill.cli", "train", task]
-    command += ["--out", str(tmp_path), "--num-envs", "2", "--num-workers", "2"]
-    command += [
-        "--agent.senses",
-        "proprioception",
-        "touch",
-        "--ppo.steps-per-update",
-        "128",
-    ]
-    command += ["--agent.critic", "separate", "--agent.auxiliary-weight", "0"]
-    command += ["--ppo.minibatch", "None", "--ppo.epochs", "1", "--resume"]
+    options = "--num-envs 2 --num-workers 2 --agent.senses proprioception touch "
+    options += "--agent.critic separate --agent.auxiliary-weight 0 --ppo.epochs 1 "
+    options += "--ppo.steps-per-update 128 --ppo.minibatch None --resume --out"
+    command += [*options.split(), str(tmp_path)]
     table, done = tmp_path / "metrics.csv", 0
     blows = (
         lambda pid: os.killpg(pid, signal.SIGINT),  # as a terminal does
