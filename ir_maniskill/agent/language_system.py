@@ -178,6 +178,7 @@ class LexiconTransformer(TokenTransformer):
         """Make the untrained layers."""
         super().__init__(config)
         self.vocabulary = config.vocabulary
+        lexicon(self.vocabulary)  # before threads ask for it, each to make its own
 
     def forward(self, text: Tensor) -> Tensor:
         """Return G_t [N, width] of the sentences' bytes [N, B].
