@@ -18,12 +18,7 @@ from ir_maniskill.agent.language_system import LexiconTransformer, TokenTransfor
 from ir_maniskill.environment.senses import text_of, tokens_of
 from ir_maniskill.language import words
 from ir_maniskill.language.grammar import RULES, SAID, words_by_mark
-from ir_maniskill.language.lexicon import (
-    Lexicon,
-    function_words,
-    lexicon,
-    word_vectors,
-)
+from ir_maniskill.language.lexicon import Lexicon, function_words, word_vectors
 from ir_maniskill.language.tokens import split_words
 from ir_maniskill.training import checkpoint
 
@@ -122,9 +117,9 @@ def test_an_unknown_word_is_the_mixture_of_its_neighbors():
 
 
 def test_the_lexicon_is_there_before_threads_ask_for_it():
-    lexicon.cache_clear()
+    language_system.lexicon.cache_clear()
     encoder("lexicon")
-    assert lexicon.cache_info().currsize == 1
+    assert language_system.lexicon.cache_info().currsize == 1
 
 
 def test_gradients_reach_the_words_that_are_mixed():

@@ -12,6 +12,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from toy_envs import (
     LENGTH,
     SENTENCES,
+    TASK,
     ToyVectorEnv,
     records,
     steps_of,
@@ -128,14 +129,11 @@ def test_an_evaluation_alone_changes_nothing(tmp_path):
     assert_same(tensors(tmp_path / "never"), tensors(tmp_path / "often"))
 
 
-def test_the_same_seed_gives_the_same_weights_and_another_one_others(tmp_path):
-    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+def test_another_seed_gives_other_weights(tmp_path):
+    for name, seed in (("a", 0), ("b", 1)):
         run(toy_config(tmp_path / name, seed=seed, total_steps=UPDATE))
-    a, b, c = (tensors(tmp_path / name) for name in "abc")
-    assert_same(a, b)
-    assert not torch.equal(
-        a["agent.actor.mean.0.weight"], c["agent.actor.mean.0.weight"]
-    )
+    a, b = (tensors(tmp_path / name)["agent.actor.mean.0.weight"] for name in "ab")
+    assert not torch.equal(a, b)
 
 
 def test_whatever_stops_it_the_last_complete_update_is_kept(tmp_path, interrupt):
@@ -387,6 +385,8 @@ def test_a_number_that_there_is_not_is_refused_by_what_there_is():
         train("NaoTouchCubeSingle-v1", gamma=0.9)
     with pytest.raises(ConfigError, match="preset: got 'fast', available: default, "):
         train("NaoTouchCubeSingle-v1", preset="fast")
+    with pytest.raises(ConfigError, match="task: got Exp.*expected an id or a TrainC"):
+        train(TASK)
 
 
 def test_a_folder_with_a_run_is_not_overwritten(tmp_path):

@@ -90,6 +90,7 @@ def train(
         usual = stored or beginning_with(changes.get("init_from"), CONFIGS[preset])
         config = dataclasses.replace(usual, **changes)
     else:
+        require(isinstance(task, TrainConfig), "task", task, "an id or a TrainConfig")
         config = dataclasses.replace(task, **changes)
         stored = stored_config(Path(config.out)) if resume else None
         if stored is not None:
