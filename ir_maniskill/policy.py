@@ -204,15 +204,15 @@ def load_policy(
     Raises:
         CheckpointError: There is no such file, or it cannot be used.
     """
-    path, own = Path(id_or_path), shipped(str(id_or_path))
-    if own.exists() and id_or_path in catalog.available():
-        path = own
+    path, name = Path(id_or_path), str(id_or_path)
+    if name in catalog.available() and shipped(name).exists():
+        path = shipped(name)
     if path.is_dir():
         path = path / "best.safetensors"
     if not path.exists():
         ids = ", ".join(name for name in catalog.available() if shipped(name).exists())
         raise CheckpointError(
-            f"policy: got {str(id_or_path)!r}, expected an existing file, a run's "
+            f"policy: got {name!r}, expected an existing file, a run's "
             "folder with a best policy, or a task whose policy ships with the package: "
             + ids
         )

@@ -2,6 +2,7 @@
 
 import logging
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -119,7 +120,8 @@ def test_a_path_is_a_path(tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run.safetensors").touch()
     shutil.copy(shipped("NaoInstruct-v1"), tmp_path / "run" / "best.safetensors")
-    assert ir_maniskill.load_policy(tmp_path / "run").env_id == "NaoInstruct-v1"
+    for known in (tmp_path / "run", Path("NaoInstruct-v1")):
+        assert ir_maniskill.load_policy(known).env_id == "NaoInstruct-v1"
 
 
 def test_what_cannot_be_loaded_says_what_can(tmp_path):
