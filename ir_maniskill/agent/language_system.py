@@ -161,7 +161,7 @@ def _require_length(length: int, longest: int) -> None:
         raise ValueError(
             f"instruction: got a sentence of {length} tokens, expected at most "
             f"{longest}; say it in fewer words, or train an agent with a larger "
-            "language_length"
+            "language_length, as the preset 'listen' has"
         )
 
 

@@ -79,6 +79,7 @@ def train(
         TrainingDivergedError: If a number stopped being finite.
         WorkerError: If a simulator process died or hangs.
     """
+    changes = {k: str(v) if isinstance(v, Path) else v for k, v in changes.items()}
     if isinstance(task, str):
         require_choice("preset", preset, CONFIGS)
         for name in changes:
