@@ -198,6 +198,11 @@ def test_a_run_that_began_with_a_policys_words_keeps_them(tmp_path, monkeypatch)
     assert run(given, resume=True) == begun
 
 
+def test_a_folder_may_be_a_path(tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "run", lambda config, *_: config)
+    assert training.train("NaoTouchCubeSingle-v1", out=tmp_path).out == str(tmp_path)
+
+
 def test_records_have_no_steps_made_again(tmp_path, interrupt):
     interrupt(4, TrainingDivergedError)  # leaves the checkpoint of the second update
     with pytest.raises(TrainingDivergedError):
