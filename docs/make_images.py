@@ -5,6 +5,8 @@ python docs/make_images.py nao NaoTouchCubeMulti-v1  # these
 """
 
 import argparse
+import csv
+import io
 import textwrap
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -16,6 +18,7 @@ from typing import Any
 import gymnasium as gym
 import torch
 from mani_skill.utils.sapien_utils import look_at
+from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
 import ir_maniskill  # noqa: F401 - registers the tasks
@@ -68,6 +71,13 @@ SCENE, TOLD = (
     ),
 )
 """Seed of a scene, and what its film tells the policy there, one after the other."""
+RUNS = FOLDER.parent / "results" / "runs"
+CURVES: dict[tuple[str, str], dict[str, Any]] = {
+    ("default", "Cube"): {"color": "#2f6fde", "label": "default (PPO), cubes"},
+    ("default", "Button"): {"color": "#9dbcf2", "label": "default (PPO), buttons"},
+    ("listen", "Cube"): {"color": "#d9822b", "label": "listen (SAC), cubes"},
+}
+"""Presets and shapes whose curves there are in `RUNS`, and how they are drawn."""
 FAILURE = (EVALUATION_SEED + 35, 2)
 """Seed and sentence of an episode in which the shipped policy touches a wrong cube."""
 
@@ -173,6 +183,33 @@ def glimpse(split: str, size: tuple[int, int], seed: int) -> tuple[Image.Image, 
     return view, said
 
 
+def curves() -> Image.Image:
+    """Return the evaluations of trainings, over steps and over minutes."""
+    figure = Figure((4 * len(LAYOUTS), 6), dpi=100, layout="constrained")
+    grid = figure.subplots(2, len(LAYOUTS), sharey=True)
+    for column, layout in zip(grid.T, LAYOUTS, strict=True):
+        for axes, unit in zip(column, ("steps", "minutes"), strict=True):
+            axes.set(title=layout, xlabel=unit, ylim=(-3, 103))
+            axes.spines[["top", "right"]].set_visible(False)
+            axes.grid(axis="y", color="#e7eaef")
+            for (preset, shape), style in CURVES.items():
+                path = RUNS / f"{preset}-NaoTouch{shape}{layout}-v1.csv"
+                if not path.exists():
+                    continue
+                rows = list(csv.DictReader(path.open()))
+                x, y = ([float(row[k]) for row in rows] for k in (unit, "exclusive"))
+                dots = [100 * share for share in y]
+                axes.plot([0, *x], [0, *dots], "o-", markersize=4, **style)
+            if unit == "steps":
+                axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g} k")
+    for axes in grid[:, 0]:
+        axes.set_ylabel("exclusive success [%]")
+    lines = grid[0, 0].lines
+    figure.legend(handles=lines, loc="outside upper center", ncols=len(lines))
+    figure.savefig(picture := io.BytesIO())
+    return Image.open(picture).convert("RGB")
+
+
 def save(make: Callable[[], Image.Image], path: Path) -> None:
     """Write a picture, small."""
     page = make().quantize(256, dither=Image.Dither.FLOYDSTEINBERG)
@@ -227,7 +264,10 @@ def main() -> None:
     """Write what is asked for."""
     pictures = {
         name: partial(save, make)
-        for name, make in (("nao", hero), ("tasks", scenes), ("instruct", instruct))
+        for name, make in (
+            *(("nao", hero), ("tasks", scenes)),
+            *(("instruct", instruct), ("curves", curves)),
+        )
     }
     films = {task: partial(film, task) for task in FILMS}
     films |= {"failure": failure, "training": training}
