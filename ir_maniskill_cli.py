@@ -36,7 +36,7 @@ Train an agent. Ctrl-C is safe: --resume goes on from there.
 
   --preset NAME       which numbers to start from:
                         default   recommended: pictures, joints and touch, dense
-                                  reward; half an hour on two cores for 3 cubes
+                                  reward; 20 minutes on two cores for 3 cubes
                         vision    pictures and the sentence alone
                         listen    many sentences: a teacher, and a policy
                         paper     as published: sparse reward, much slower
