@@ -1,6 +1,7 @@
 """The pages' code and commands work, links lead somewhere, all public is documented."""
 
 import doctest
+import importlib.util
 import os
 import pkgutil
 import re
@@ -57,12 +58,16 @@ def test_the_commands_of_the_pages_are_understood() -> None:
 @pytest.mark.slow
 def test_the_code_of_short_pages_runs(tmp_path: Path) -> None:
     pages = README.read_text() + (ROOT / "docs" / "other_tools.md").read_text()
-    play, task, left_hand = re.findall(r"^```python\n(.*?)^```", pages, re.M | re.S)
+    blocks = re.findall(r"^```python\n(.*?)^```", pages, re.M | re.S)
+    play, task, left_hand, other = blocks
     assert run(tmp_path, "-c", play).endswith("tensor([True])\n")
     run(tmp_path, "-c", left_hand)
     (tmp_path / "fruit.py").write_text(task)
     make = "import gymnasium as gym; gym.make('fruit:Fruit-v1', obs_mode='state')"
     run(tmp_path, "-c", make)
+    if importlib.util.find_spec("stable_baselines3"):
+        here = f"import sys; sys.path.append({str(ROOT)!r})\n"
+        run(tmp_path, "-c", here + other.replace("20_000", "110"))
 
 
 def test_the_readme_is_short() -> None:

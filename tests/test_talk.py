@@ -94,7 +94,7 @@ def test_goals_are_told_in_plain_words(goal, words):
 
 @pytest.fixture(scope="module")
 def opened():
-    with_policy = Session("NaoTouchCubeShuffled-v1", seed=3)
+    with_policy = Session("NaoTouchCubeTriangle-v1", seed=3)
     yield with_policy
     with_policy.close()
 
@@ -102,10 +102,10 @@ def opened():
 @pytest.fixture
 def session(opened):
     if (
-        opened.choice.task != "NaoTouchCubeShuffled-v1"
+        opened.choice.task != "NaoTouchCubeTriangle-v1"
         or opened.choice.policy == RANDOM
     ):
-        opened.choose(task="NaoTouchCubeShuffled-v1", policy="NaoTouchCubeShuffled-v1")
+        opened.choose(task="NaoTouchCubeTriangle-v1", policy="NaoTouchCubeTriangle-v1")
     opened.seed = 2
     opened.new_scene()
     return opened
@@ -168,8 +168,8 @@ def test_no_text_breaks_it(opened, text):
 
 @pytest.mark.render
 def test_a_sentence_longer_than_the_policy_reads_is_cut(session):
-    session.tell("Touch the green cube with your left hand.")
-    assert session.reading.said == "Touch the green cube with"
+    session.tell("please " * 12 + "touch the green cube with your left hand.")
+    assert session.reading.said == "please " * 12 + "touch the green cube"
     assert session.reading.goal == Touch(Ref("green", "cube"), "left")
 
 
@@ -239,7 +239,7 @@ def test_where_no_policy_fits_chance_moves_the_robot(session):
     session.step()
     assert session.reading.goal is None and "right" in session.reading.meaning
     session.choose(robot="nao")
-    assert session.choice.policy == "NaoTouchCubeShuffled-v1"
+    assert session.choice.policy == "NaoTouchCubeTriangle-v1"
 
 
 @pytest.mark.render
@@ -500,18 +500,18 @@ def visited(page, folder):
         seen["moved"] = np.abs(session.poses() - start)[:, :3].max()
         wait_for(lambda: "success" in browser.text())
         browser.screenshot(folder / "told.png")
-        place = session.scene.position[0, 0].numpy()
+        place = session.scene.position[0, 2].numpy()
         x, y = pixel(page, place)
         drag(browser, x, y)
         browser.mouse("mouseReleased", x - 48, y + 48)
         wait_for(lambda: session.held is None)
-        seen["dragged"] = np.linalg.norm(session.scene.position[0, 0].numpy() - place)
+        seen["dragged"] = np.linalg.norm(session.scene.position[0, 2].numpy() - place)
         say("dance <i>twice</i>")
         wait_for(lambda: "not understood" in browser.text())
         seen["nonsense"] = browser.text()
         browser.screenshot(folder / "nonsense.png")
         seen["asked"] = browser.seen
-        drag(browser, *pixel(page, session.scene.position[0, 0].numpy()))
+        drag(browser, *pixel(page, session.scene.position[0, 2].numpy()))
         wait_for(lambda: session.held is not None)
     return seen  # the browser is closed while it holds the object
 
