@@ -308,8 +308,12 @@ class Push(Goal):
     """Level of a whole push: that of a touch with all fingers of one hand of NAO."""
     BEHIND = 0.04
     """How far behind its center fingers should be to push it [m]."""
-    HEIGHT = 2.0
-    """Weight of their height in the gap: from above they slide over it."""
+    OVER = 0.05
+    """How high above its center they pass over it on their way there [m]."""
+    DOWN = 0.015
+    """How near that place, seen from above, they are down [m]."""
+    STEEP = 2.0
+    """How steep they go down to it; also the weight of being higher or lower."""
 
     def __post_init__(self) -> None:
         self._check(ref=Ref, distance=Real)
@@ -327,8 +331,11 @@ class Push(Goal):
         strayed = (aside - Push.STRAIGHT * along.clamp(min=0)).clamp(min=0)
         serves = asked.ref[:, None].expand_as(scene.contact)
         behind = -Push.BEHIND * asked.ref[..., None] * asked.direction[:, None]
-        x, y, z = (scene.to_object - behind[:, None]).unbind(dim=3)
-        way = (x.square() + y.square() + (Push.HEIGHT * z).square()).sqrt()
+        off = scene.to_object - behind[:, None]  # [N, F, C, 3], from there
+        ahead = (off * asked.direction[:, None, None]).sum(dim=3)
+        over = (Push.STEEP * (ahead - Push.DOWN)).clamp(0, Push.OVER)
+        x, y, z = off.unbind(dim=3)
+        way = (x.square() + y.square() + (Push.STEEP * (z - over)).square()).sqrt()
         way = way.where(serves, torch.inf).flatten(1).amin(dim=1)
         gap = (asked.distance - along).clamp(min=0) + strayed + way
         gap = gap.masked_fill(holds, 0.0)
@@ -387,7 +394,7 @@ class Both(Goal):
             bars=a.bars | b.bars,
             level=(a.level + b.level) * torch.where(holds, 1.0, Both.HALF),
             still=later(lambda: a.still | b.still),
-            may_move=a.may_move | b.may_move,
+            may_move=_may_move(a, b),
             aim=later(lambda: a.aim + b.aim),
         )
 
@@ -419,10 +426,16 @@ class Then(Goal):
             b,
             serves=a.serves | b.serves,  # the hand is still where it was sent first
             level=1 + b.level,
-            may_move=a.may_move | b.may_move,
+            may_move=_may_move(a, b),
             stage=1 + b.stage,
         )
         return Measure.where(begun, second, first)
+
+
+def _may_move(a: Measure, b: Measure) -> Tensor:
+    """Return what two goals let move: each also what the other touches [N, C] bool."""
+    touched_by_a, touched_by_b = a.serves.any(dim=1), b.serves.any(dim=1)
+    return (a.may_move | touched_by_b) & (b.may_move | touched_by_a)
 
 
 def _is_sequence(goal: Goal) -> bool:

@@ -132,8 +132,9 @@ def test_push_measures_the_way_along_and_to_the_side(moved, holds, gap, level):
     at.fingertip[:, 4] = at.position[:, 1] - torch.tensor([0.03, 0.04, 0.02])
     measure, verdict = measured(Push(RED, "left", 0.05), at)
     assert measure.holds.item() == holds
-    # A finger is 3 cm beside the way and 2 cm too low or high, which counts twice.
-    way = math.hypot(0.03, 0.04)
+    # A finger is 3 cm beside the place behind it. There it should be 3 cm higher, and
+    # is 2 cm lower; height counts twice.
+    way = math.hypot(0.03, 0.1)
     assert measure.gap.item() == pytest.approx(0 if holds else gap + way, abs=1e-4)
     assert measure.level.item() == pytest.approx(level)
     assert not verdict.foul
@@ -168,6 +169,20 @@ def test_touch_this_but_not_that():
     assert outcome(goal, scene((0, 1))) == (True, 0.0, False)
     assert outcome(goal, scene((0, 1), (1, 0)))[2]
     assert outcome(goal, scene((0, 1), (1, 2)))[2]  # another one is no better
+
+
+@pytest.mark.parametrize(
+    ("goal", "foul"),
+    [  # what moves is blue
+        (Both(Push(RED, "left"), Avoid(GREEN)), True),
+        (Both(Push(RED, "left"), Touch(BLUE)), False),
+        (Then(Push(RED, "left"), Touch(BLUE)), False),
+        (Then(Push(RED, "left"), Touch(GREEN)), True),
+    ],
+)
+def test_of_two_goals_each_lets_move_what_the_other_touches(goal, foul):
+    at = scene((0, 1), moved=(0.021, 0.0, 0.0), stage=1)
+    assert measured(goal, at)[1].foul.item() == foul
 
 
 def test_then_goes_on_when_the_first_is_reached():

@@ -12,7 +12,7 @@ from ir_maniskill.environment.senses import read_text, text_of
 from ir_maniskill.goals import Avoid, Both, Instruction, Push, Ref, Then, Touch
 from ir_maniskill.snapshot import Snapshot
 from ir_maniskill.training.config import CONFIGS
-from ir_maniskill.training.hindsight import Hindsight, Pursuit
+from ir_maniskill.training.hindsight import Hindsight, Pursuit, _in_turns
 
 HANDS = {"left": ("a", "b", "c"), "right": ("d", "e", "f")}
 LISTEN = CONFIGS["listen"]
@@ -123,6 +123,18 @@ def test_sentences_that_came_true_are_preferred() -> None:
         any_of_them = hindsight.find(scene(), "Touch the blue one.", 4)
         found += int(hindsight.judge(episode, any_of_them).holds.any(dim=0).sum())
     assert chosen > 1.5 * found > 0
+
+
+def test_what_came_true_takes_turns_by_what_it_asks_the_rarest_first() -> None:
+    red, can = Ref("red"), Ref("red", "can")
+    touches = [Touch(red), Touch(can), Both(Touch(red), Avoid(can)), Touch(red, "left")]
+    found = told(*touches, Push(can, "away"), Push(red, "away"), Push(can, "left"))
+    fulfilled = torch.tensor([True, True, True, False, True, True, True])
+    order = _in_turns(found, fulfilled)
+    assert set(order[:2]) == {2, 6}  # one of a kind each
+    touch, push = {0, 1}, {4, 5}
+    for turn in (set(order[2:4]), set(order[4:])):
+        assert len(turn & touch) == len(turn & push) == 1
 
 
 @pytest.mark.parametrize("task", ["NaoTouchCubeShuffled-v1", "NaoInstruct-v1"])

@@ -8,8 +8,10 @@ Legend: R = T + 1 rows of an episode of T steps, M sentences, F fingers, C objec
 
 from __future__ import annotations
 
+import itertools
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from random import Random
 
 import torch
@@ -25,7 +27,7 @@ from ir_maniskill.environment.robots.robot import robot_class
 from ir_maniskill.environment.senses import read_text, text_of, tokens_of
 from ir_maniskill.environment.speaker import Speaker
 from ir_maniskill.experiment import Experiment, Spoken
-from ir_maniskill.goals import SHAPES, Goal, Instruction, Measure
+from ir_maniskill.goals import SHAPES, Goal, Instruction, Measure, Ref
 from ir_maniskill.language import handwritten, loosely, parse, things
 from ir_maniskill.snapshot import Snapshot
 from ir_maniskill.training.config import TrainConfig
@@ -129,13 +131,11 @@ class Hindsight:
         """
         found = self.find(episode.rows(torch.tensor([0])), said, SOUGHT * self.others)
         judged = self.judge(episode, found)
-        luck = judged.holds.any(dim=0) + torch.rand(len(found))
-        luck[0] = 3.0  # what was said is among them
-        order = luck.argsort(descending=True)
-        half = 1 + self.others // 2
-        any_other = order[half:][torch.randperm(len(found) - half)]
-        chosen = torch.cat([order[:half], any_other])[: self.sentences]
-        return [found[i] for i in chosen.tolist()], judged.columns(chosen)
+        lucky = _in_turns(found, judged.holds.any(dim=0))
+        first = [0, *(i for i in lucky if i > 0)][: 1 + self.others // 2]
+        others = [i for i in torch.randperm(len(found)).tolist() if i not in first]
+        chosen = [*first, *others][: self.sentences]
+        return [found[i] for i in chosen], judged.columns(torch.tensor(chosen))
 
     def said(self, text: str) -> Instruction:
         """Return the instruction of a sentence."""
@@ -202,6 +202,23 @@ class Hindsight:
 
 
 _CPU = torch.device("cpu")
+
+
+def _in_turns(found: Sequence[Instruction], fulfilled: Tensor) -> list[int]:
+    """Return which were fulfilled: what they ask takes turns, the rarest first."""
+    alike: dict[object, list[int]] = defaultdict(list)
+    for i in torch.randperm(len(found)).tolist():
+        if fulfilled[i]:
+            alike[_asked(found[i].goal)].append(i)
+    turns = itertools.zip_longest(*sorted(alike.values(), key=len))
+    return [i for turn in turns for i in turn if i is not None]
+
+
+def _asked(goal: Goal) -> tuple[object, ...]:
+    """Return what a goal asks, of whatever object."""
+    values = [getattr(goal, field.name) for field in fields(goal)]
+    asked = [value for value in values if not isinstance(value, Ref)]
+    return type(goal), *(_asked(v) if isinstance(v, Goal) else v for v in asked)
 
 
 def _staged(
