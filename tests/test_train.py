@@ -377,9 +377,11 @@ def test_what_the_weights_need_comes_with_them_unless_it_is_told(before):
 
 def test_a_task_is_named_with_its_module_as_elsewhere(monkeypatch):
     monkeypatch.setattr(training, "run", lambda config, *_: config)
-    config = train("ir_maniskill.tasks.single:NaoTouchCubeSingle-v1")
+    name = "ir_maniskill.tasks.single:NaoTouchCubeSingle-v1"
+    config = train(name)
     assert config.env_id == "NaoTouchCubeSingle-v1"
     assert config.out == "runs/NaoTouchCubeSingle-v1"
+    assert train(TrainConfig(env_id=name)).env_id == "NaoTouchCubeSingle-v1"
 
 
 # -- Refusals --------------------------------------------------------------------------

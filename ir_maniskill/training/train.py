@@ -93,6 +93,9 @@ def train(
     else:
         require(isinstance(task, TrainConfig), "task", task, "an id or a TrainConfig")
         config = dataclasses.replace(task, **changes)
+        if envs is None:
+            env_id = catalog.get(config.env_id).id
+            config = dataclasses.replace(config, env_id=env_id)
         stored = stored_config(Path(config.out)) if resume else None
         if stored is not None:
             experiment = envs.experiment if envs else catalog.get(stored.env_id)
