@@ -403,8 +403,12 @@ def test_rewards_are_arrays_to_numpy_and_plain_tensors_to_torch(
     envs.reset(seed=0)
     _, reward, terminated, truncated, _ = envs.step(torch.zeros(3, 26))
     either = np.logical_or(terminated, truncated)
-    for array in (either, np.where(either, 0, reward), np.zeros(3) + reward):
+    for array in (
+        *(either, np.where(either, 0, reward), np.zeros(3) + reward),
+        *(np.stack([reward, reward]), np.add(reward, 1, out=reward)),
+    ):
         assert type(array) is np.ndarray
+    assert np.sum(np.ones(3), where=terminated) == 0
     assert np.sum(either) == 0
     assert (1 - terminated).tolist() == [1, 1, 1]
     assert torch.equal(1 - reward, -(reward - 1))
