@@ -14,7 +14,15 @@ from ir_maniskill.environment.layout import layout_of
 from ir_maniskill.environment.robots import Nao, Panda
 from ir_maniskill.environment.speaker import Speaker, resolve
 from ir_maniskill.experiment import Drawn, Experiment, ExperimentError, Spoken
-from ir_maniskill.goals import COLORS, SHAPES, Instruction, Push, Ref, Touch
+from ir_maniskill.goals import (
+    COLORS,
+    SHAPES,
+    GoalError,
+    Instruction,
+    Push,
+    Ref,
+    Touch,
+)
 from ir_maniskill.language import (
     HELD_OBJECTS,
     HELD_PAIRS,
@@ -273,6 +281,17 @@ def test_a_sentence_that_fits_no_scene_is_refused(
     text = "Touch the red cube left of the red cube."
     with pytest.raises(ValueError, match=f"got '{text}', expected what is true"):
         env.reset(options={"instruction": text, "reconfigure": False})
+
+
+def test_where_no_hand_reaches_nothing_can_be_told(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("ir_maniskill.environment.speaker.SCENES", 20)
+    far = ((0.30, 0.36), (-0.3, -0.1))
+    task = Experiment("Far-v1", Drawn((1, 2), area=far), Spoken())
+    told = [Instruction("Touch the leftmost one.", Touch(Ref(where="leftmost")))]
+    with pytest.raises(GoalError, match="got 'Touch the leftmost one.', expected what"):
+        Speaker(task, layout_of(task, Nao)).draw([np.random.RandomState(0)], told)
 
 
 def test_a_robot_with_one_hand_is_told_what_one_hand_can_do() -> None:
