@@ -232,6 +232,7 @@ def test_actions_of_all_kinds_are_taken_and_those_not_finite_refused(
         ({"seed": "3"}, "seed: got '3', expected an integer"),
         ({"options": {"reconfigure": "no"}}, "'reconfigure': got 'no', expected True"),
         ({"options": {"instruction": True}}, "instruction: got True"),
+        ({"options": {"reset_to_env_states": torch.zeros(1, 9)}}, "{'env_states': ..."),
     ],
 )
 def test_resets_of_the_wrong_kind_are_refused(

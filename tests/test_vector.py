@@ -228,8 +228,16 @@ WRONG_RESETS = [
     ({"options": {"instruction": 1.5}}, "instruction: got 1.5"),
     ({"options": {"instruction": [0, 1]}}, r"got \[0, 1\], .* or a list of 3"),
     ({"options": {"instruction": "Touch."}}, "got 'Touch.'.*, one of .*red cube"),
+    (
+        {"options": {"instruction": "Touch the red cube with your left hand."}},
+        "got 'Touch the red cube with your left hand.', expected at most 5 words",
+    ),
     ({"options": {"reconfigure": 1}}, "'reconfigure': got 1, expected True or False"),
     ({"options": {"reset_to_env_states": torch.zeros(3, 9)}}, "expected {'env_states'"),
+    (
+        {"options": {"reset_to_env_states": {"env_states": {"actors": {}}}}},
+        "got .*'actors'.*, expected .* what get_state or get_state_dict returned",
+    ),
     (
         {"options": {"reset_to_env_states": {"env_states": torch.zeros(2, 9)}}},
         r"\['env_states'\]: got float32 of shape \(2, 9\), expected .* 3 rows",
@@ -255,7 +263,7 @@ def test_wrong_resets_are_refused_and_change_nothing(
 def test_what_only_an_env_can_refuse_leaves_the_others_usable(
     envs: ProcessVectorEnv,
 ) -> None:
-    nobody = {"actors": {"nobody": torch.zeros(3, 13)}}
+    nobody = {"actors": {"nobody": torch.zeros(3, 13)}, "task": {}}
     for states in (nobody, torch.zeros(3, 5)):
         with pytest.raises(WorkerError, match=r"worker-0 \(envs 0 to 1\) failed"):
             envs.reset(options={"reset_to_env_states": {"env_states": states}})

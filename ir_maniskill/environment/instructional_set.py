@@ -27,7 +27,6 @@ from ir_maniskill.goals import (
     Touch,
 )
 from ir_maniskill.language.draw import things
-from ir_maniskill.language.tokens import split_words
 from ir_maniskill.snapshot import Snapshot
 
 Deal = Callable[[Tensor, Tensor, Snapshot], Any]
@@ -71,8 +70,7 @@ class InstructionalSet:
         """Return the set in which some envs, by their places, were told something.
 
         Raises:
-            GoalError: A sentence is too long for the observation, or asks for a hand
-                that the robot does not have.
+            GoalError: A sentence asks for a hand that the robot does not have.
         """
         instructions, other = list(self.instructions), copy.copy(self)
         for env, instruction in said.items():
@@ -83,12 +81,6 @@ class InstructionalSet:
     def _write(self, instructions: list[Instruction]) -> None:
         length, device = self._experiment.max_tokens, self._device
         texts = [instruction.text for instruction in instructions]
-        for text in texts:
-            if len(split_words(text)) > length:
-                raise GoalError(
-                    f"instruction text: got {text!r}, expected at most {length} words "
-                    "and full stops in this task"
-                )
         self.instructions = instructions
         self.tokens = tokens_of(texts, self._experiment.vocabulary, length).to(device)
         self.text = text_of(texts, TEXT_BYTES).to(device)
