@@ -156,7 +156,9 @@ def test_what_is_out_of_reach_is_refused(robot: type[Robot], far: str) -> None:
 # -- Names ------------------------------------------------------------------
 
 
-def test_robots_have_short_names_that_leave_maniskills_alone() -> None:
+def test_robots_have_short_names_that_leave_others_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     for name, robot in ROBOTS.items():
         assert find_robot(name) == find_robot(robot.uid) == robot.uid
         assert find_robot(robot) is robot
@@ -164,6 +166,8 @@ def test_robots_have_short_names_that_leave_maniskills_alone() -> None:
     for unknown in ("unitree_g1", "moon"):
         with pytest.raises(RobotError, match=f"got '{unknown}'.*nao, .*panda"):
             find_robot(unknown)
+    monkeypatch.setitem(REGISTERED_AGENTS, "g1", REGISTERED_AGENTS["nao"])
+    assert find_robot("g1") == "g1"  # somebody's own
 
 
 # -- Pictures ------------------------------------------------------------------

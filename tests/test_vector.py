@@ -343,6 +343,7 @@ def test_wrong_actions_are_refused_and_no_env_steps(
         ({"num_workers": 0}, "num_workers: got 0, expected a whole number, at least 1"),
         ({"timeout": 0}, "timeout: got 0, expected more than 0"),
         ({"task_id": None}, "task id: got None, expected a str"),
+        ({"sim_backend": None}, "sim_backend: got None, expected 'auto' or one of"),
         ({"sim_backend": "gpus"}, "sim_backend: got 'gpus', expected 'auto' or one of"),
         ({"task_id": "NoSuchTask-v1"}, "available"),
     ],

@@ -189,6 +189,8 @@ def test_a_hanging_worker_is_named_instead_of_waited_for() -> None:
     os.kill(pid, signal.SIGSTOP)
     envs.close()
     assert not alive(pid)
+    with pytest.raises(WorkerError, match="nothing to wait for"):
+        envs.step_wait()
 
 
 @pytest.mark.slow

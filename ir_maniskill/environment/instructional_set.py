@@ -15,6 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ir_maniskill.checks import require_choice
 from ir_maniskill.environment.senses import TEXT_BYTES, text_of, tokens_of
 from ir_maniskill.experiment import Experiment, Spoken
 from ir_maniskill.goals import (
@@ -176,6 +177,8 @@ def _column(name: str, values: list[Any], hands: Mapping[str, Tensor]) -> Deal:
     if name == "hand":
         return _indexed(torch.stack([_fingers(value, hands) for value in values]))
     if name == "direction":
+        for value in values:
+            require_choice("direction of a goal", value, DIRECTIONS, GoalError)
         return _indexed(torch.tensor([DIRECTIONS[v] for v in values], device=device))
     if all(isinstance(value, Real) for value in values):
         return _indexed(torch.tensor(values, dtype=torch.float32, device=device))

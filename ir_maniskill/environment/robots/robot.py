@@ -326,7 +326,7 @@ def find_robot(robot: str | type[BaseAgent]) -> str | type[Robot]:
     if isinstance(robot, type) and issubclass(robot, Robot):
         return robot
     uids = available_robots()
-    for uid in uids:
+    for uid in sorted(uids, key=lambda uid: uid != robot):  # its own uid comes first
         if robot in (uid, short_name(uid)):
             return uid
     raise RobotError(
