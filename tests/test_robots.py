@@ -223,7 +223,7 @@ def edge(camera: CameraConfig, points: np.ndarray) -> float:
 # -- A robot of one's own --------------------------------------------------------------
 
 BOX = "<collision><geometry><box size='0.02 0.02 0.1'/></geometry></collision>"
-MIRRORED = BOX.replace("box size='0.02 0.02 0.1'", "mesh filename='x' scale='1 -1 1'")
+MESH = BOX.replace("box size='0.02 0.02 0.1'", "mesh filename='x' scale='1 -1 1'")
 INERTIAL = (
     "<inertial><mass value='0.1'/><inertia ixx='1e-3' iyy='1e-3' izz='1e-3' ixy='0' "
     "ixz='0' iyz='0'/></inertial>"
@@ -319,14 +319,18 @@ def test_a_joint_that_is_not_driven_is_held_and_one_that_mimics_is_free(
         (link("arm"), "link 'arm': got two"),
         (joint("lift", "arm", "tip"), "joint 'lift': got two"),
         (link("flag", BOX.replace("0.02 0.02 0.1", "0")), "link 'flag': <box> size"),
-        (link("flag", MIRRORED), "link 'flag': <mesh> scale.*mirror"),
+        (link("flag", BOX.replace("box size", "cone size")), "'flag': <geom.*got cone"),
+        (link("flag", MESH), "link 'flag': <mesh> scale.*mirror"),
+        (link("flag", MESH.replace("1 -1 1", "1")), "got '1', expected three numbers"),
+        (link("flag", MESH.replace("1 -1", "1 1").replace("'x'", "''")), "'filename'"),
+        (link("flag").replace("1e-3", "0"), "'flag': <inertial>.* of inertia 0 0 0"),
+        (link("flag").replace("value='0.1'", "value='-1'"), "got a mass of -1 kg"),
+        (link(""), "a <link> has no name"),
         (joint("spin", "arm", "tip").replace("0 1 0", "0 0 0"), "'spin': <axis>"),
         ("<link>", "not XML"),
     ],
 )
-def test_what_a_driven_joint_lacks_is_named(
-    tmp_path: Path, part: str, named: str
-) -> None:
+def test_what_a_file_lacks_is_named(tmp_path: Path, part: str, named: str) -> None:
     path = Path(written(tmp_path, ARM, link("tip"), part))
     with pytest.raises(RobotError, match=f"stick.urdf: .*{named}"):
         read_motors(path, ("lift", "bend_1"))
