@@ -119,22 +119,16 @@ def test_the_defaults_are_the_papers() -> None:
     env.close()
 
 
-def test_pictures_that_a_shader_pack_cannot_draw_are_refused() -> None:
-    with pytest.raises(ValueError, match="'rgbd', but the shader pack of .* only rgb;"):
-        gym.make(
-            "NaoTouchCubeSingle-v1",
-            obs_mode="rgbd",
-            sensor_configs={"width": 32, "height": 64, "shader_pack": "unlit"},
-        )
-
-
-def test_a_shader_pack_that_is_not_there_is_refused() -> None:
-    with pytest.raises(ValueError, match="'unlt', available: .*trivial, unlit"):
-        gym.make(
-            "NaoTouchCubeSingle-v1",
-            obs_mode="rgb",
-            sensor_configs={"shader_pack": "unlt"},
-        )
+@pytest.mark.parametrize(
+    ("mode", "pack", "message"),
+    [
+        ("rgbd", "unlit", "'rgbd', but the shader pack of .* only rgb;"),
+        ("rgb", "unlt", "'unlt', available: .*trivial, unlit"),
+    ],
+)
+def test_shader_packs_that_cannot_draw_are_refused(mode, pack, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        gym.make(IDS[0], obs_mode=mode, sensor_configs={"shader_pack": pack})
 
 
 @pytest.mark.parametrize(

@@ -112,7 +112,9 @@ def test_observations_are_in_the_declared_space(
     obs, _ = envs.reset(seed=0)
     assert obs["extra"]["object_position"].shape == (3, 3, 3)
     assert envs.observation_space.contains(arrays(obs))
-    assert flat.observation_space.contains(arrays(flat.reset(seed=0)[0]))
+    state, _ = flat.reset(seed=0)
+    assert state.shape == (3, 26 * 3 + 6 + 5 + 9 + 18 + 3 + 6 + 1 + 1)
+    assert flat.observation_space.contains(arrays(state))
 
 
 def test_pictures_cross_the_process_border(multi_vec: ProcessVectorEnv) -> None:
