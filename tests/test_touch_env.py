@@ -135,6 +135,7 @@ def test_shader_packs_that_cannot_draw_are_refused(mode, pack, message) -> None:
     ("wrong", "message"),
     [
         ({"num_envs": 2, "sim_backend": "physx_cpu"}, "got 2, .*make_vec"),
+        ({"experiment": "NaoTouchCubeSolo-v1"}, "'NaoTouchCubeSolo-v1', available: N"),
         ({"experiment": None}, "experiment: got None, expected an Experiment or its"),
         ({"num_envs": 0}, "num_envs: got 0, expected a whole number, at least 1"),
         ({"reward_weights": {"hold": -1}}, "reward_weights.hold: got -1"),
@@ -197,15 +198,6 @@ def test_resets_of_the_wrong_kind_are_refused(
 def test_an_option_that_is_mistyped_is_told_of(fixed: gym.Env) -> None:
     with pytest.warns(UserWarning, match="'instructon' not known here, only instruct"):
         fixed.reset(options={"instructon": 1})
-
-
-def test_unknown_ids_and_modes_are_refused() -> None:
-    with pytest.raises(gym.error.NameNotFound):
-        gym.make("NaoTouchCubeSolo-v1")
-    with pytest.raises(catalog.ExperimentError, match="available: NaoTouch"):
-        TouchEnv(experiment="NaoTouchCubeSolo-v1")
-    with pytest.raises(NotImplementedError, match="smell"):
-        gym.make("NaoTouchCubeSingle-v1", reward_mode="smell", render_backend="none")
 
 
 # -- Touch ----------------------------------------------------------------------------
