@@ -9,6 +9,7 @@ import torch
 
 import ir_maniskill
 from ir_maniskill import experiment as catalog
+from ir_maniskill.environment.arguments import instructions_of
 from ir_maniskill.environment.layout import layout_of
 from ir_maniskill.environment.robots import Nao, Panda
 from ir_maniskill.environment.speaker import Speaker, resolve
@@ -307,6 +308,8 @@ def test_sentences_written_by_hand_are_said_where_they_can_be_true(
     few = Experiment("Mine-v1", Drawn(colors=("red", "blue")), Spoken())
     texts = {i.text for i in handwritten()}
     said = [i for *_, i in drawn(few, "wording", 40)]
+    spoken = [i.text for i in said]  # as a state has them
+    assert instructions_of(spoken, few.in_split("wording"), 40) == said
     assert 10 < sum(i.text in texts for i in said) < 30
     assert {ref.color for i in said for ref in i.goal.refs} <= {"red", "blue", None}
     # "Touch the only cube there is." is never true of three cubes.

@@ -14,7 +14,7 @@ from torch import Tensor
 from ir_maniskill.environment.senses import text_of
 from ir_maniskill.experiment import Experiment, Spoken
 from ir_maniskill.goals import GoalError, Instruction
-from ir_maniskill.language import SentenceError, parse
+from ir_maniskill.language import SentenceError, handwritten, parse
 from ir_maniskill.language.tokens import split_words
 
 RESET_OPTIONS = ("instruction", "reconfigure", "reset_to_env_states")
@@ -75,13 +75,14 @@ def instructions_of(
 def _instruction(given: Any, experiment: Experiment) -> Instruction:
     """Return what is meant; SentenceError or LookupError: nothing."""
     own = experiment.instructions
-    own = () if isinstance(own, Spoken) else own
+    if isinstance(own, Spoken):  # those of no grammar are said in one split alone
+        own = handwritten() if own.split == "wording" else ()
     if isinstance(given, Instruction):
         return given
     if isinstance(given, str):
         same = (i for i in own if _bare(i.text) == _bare(given))
         return next(same, None) or Instruction(given, parse(given))
-    if _whole(given) and given in range(len(own)):
+    if _whole(given) and given in range(len(experiment.sentences)):
         return own[given]
     raise LookupError
 

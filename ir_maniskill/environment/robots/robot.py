@@ -81,7 +81,7 @@ class Robot(BaseAgent, ABC):
     scale: float = 1.0
     """How large table, objects, layout and cameras are, beside NAO's."""
     shoulders: tuple[tuple[float, float], ...]
-    """Where the arms start in the world, seen from above (x, y) [m]."""
+    """Where the arm of each hand starts in the world, seen from above (x, y) [m]."""
     reach: float
     """Farthest that an object may be from a shoulder, seen from above [m]."""
     start_qpos: Tensor
