@@ -136,7 +136,7 @@ def test_shader_packs_that_cannot_draw_are_refused(mode, pack, message) -> None:
     [
         ({"num_envs": 2, "sim_backend": "physx_cpu"}, "got 2, .*make_vec"),
         ({"experiment": "NaoTouchCubeSolo-v1"}, "'NaoTouchCubeSolo-v1', available: N"),
-        ({"experiment": None}, "experiment: got None, expected an Experiment or its"),
+        ({"experiment": None}, "task id: got None, expected a str"),
         ({"num_envs": 0}, "num_envs: got 0, expected a whole number, at least 1"),
         ({"reward_weights": {"hold": -1}}, "reward_weights.hold: got -1"),
         ({"reward_weights": {"held": 1}}, "got {'held': 1}, expected .*hold, approach"),

@@ -41,7 +41,7 @@ from ir_maniskill.environment.robots.robot import (
 )
 from ir_maniskill.environment.speaker import Speaker
 from ir_maniskill.environment.table_objects import TableObjects
-from ir_maniskill.experiment import Experiment, ExperimentError, Spoken
+from ir_maniskill.experiment import Experiment, Spoken
 from ir_maniskill.goals import Instruction
 from ir_maniskill.snapshot import Snapshot, later
 
@@ -120,13 +120,8 @@ class TouchEnv(RenderedEnv):
                 is nothing of that name to observe.
             RuntimeError: No Vulkan device can render here; says what to install.
         """
-        if isinstance(experiment, str):
-            experiment = catalog.get(experiment)
         if not isinstance(experiment, Experiment):
-            raise ExperimentError(
-                f"experiment: got {experiment!r}, expected an Experiment or its id, "
-                f"available: {', '.join(catalog.available())}"
-            )
+            experiment = catalog.get(experiment)
         self.experiment = experiment.in_split(split)
         _require_one_on_cpu(kwargs)
         robot_uids = find_robot(robot_uids)
