@@ -163,9 +163,11 @@ def test_actions_of_all_kinds_are_taken_and_those_not_finite_refused(
         obs = fixed.step(action)[0]
         assert not any(leaf.requires_grad for leaf in leaves(obs).values())
     assert fixed.step([0.0] * 26)[4]["elapsed_steps"].item() == 4
+    nan = np.full(26, np.nan, np.float32)
     for bad, message in (
-        (np.full(26, np.nan, np.float32), "expected finite numbers"),
+        (nan, "expected finite numbers"),
         (torch.full((26,), torch.inf), "expected finite numbers"),
+        ({"control_mode": "pd_joint_pos", "action": nan}, "expected finite numbers"),
         ([0.0] * 25, r"got shape \(25,\), expected \(1, 26\)"),
         (torch.zeros(2, 26), r"got shape \(2, 26\)"),
         (np.zeros(26, complex), "got complex numbers"),

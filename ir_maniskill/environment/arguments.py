@@ -192,8 +192,7 @@ def _deal(name: str, value: Any, experiment: Experiment, num_envs: int) -> list:
         return instructions_of(value, experiment, num_envs)
     if name != "reset_to_env_states":
         return [value] * num_envs
-    what = f"reset option {name!r}"
-    return [_row(what, value, row, num_envs) for row in range(num_envs)]
+    return [_row(name, value, row, num_envs) for row in range(num_envs)]
 
 
 def _row(what: str, states: Any, row: int, num_envs: int) -> Any:
@@ -209,8 +208,8 @@ def _row(what: str, states: Any, row: int, num_envs: int) -> Any:
     if array.dtype.kind in "biuf" and array.ndim > 1 and len(array) in (1, num_envs):
         return array[row % len(array)][None]
     raise ValueError(
-        f"{what}: got {array.dtype} of shape {array.shape}, expected numbers with "
-        f"{num_envs} rows, one for each env, or a single one for all"
+        f"reset option {what}: got {array.dtype} of shape {array.shape}, expected "
+        f"numbers with {num_envs} rows, one for each env, or a single one for all"
     )
 
 

@@ -251,7 +251,12 @@ class Robot(BaseAgent, ABC):
 
         Args:
             action: As the control mode asks, in the order of `joints` [N, J].
+
+        Raises:
+            ValueError: It is not finite (checked on the CPU only).
         """
+        if not self.scene.gpu_sim_enabled and not action.isfinite().all():
+            raise ValueError(f"action: got {action.tolist()}, expected finite numbers")
         self.controller.set_action(action)
 
     def to_qpos(self, position: Tensor) -> Tensor:
