@@ -8,15 +8,9 @@ import trimesh
 import yourdfpy
 
 from ir_maniskill.assets.nao import SOLE_HEIGHT, URDF_PATH, build, facts
+from ir_maniskill.environment.robots.nao import FINGER_JOINTS, JOINTS
 
 MESHES = URDF_PATH.parent / "meshes"
-ARM = ("ShoulderPitch", "ShoulderRoll", "ElbowYaw", "ElbowRoll", "WristYaw")
-HAND = (
-    *("Finger11", "Finger12", "Finger13"),
-    *("Finger21", "Finger22", "Finger23"),
-    *("Thumb1", "Thumb2"),
-)
-JOINTS = tuple(side + name for side in "LR" for name in ARM + HAND)
 
 
 def read_facts(table: str, key: str) -> dict[str, dict[str, str]]:
@@ -144,7 +138,7 @@ def test_fingers_curl_at_zero_and_stretch_at_sixty_degrees(model, side):
     wrist = f"{side.lower()}_wrist"
     reach = {}
     for angle in (0.0, math.radians(60)):
-        model.update_cfg({name: angle for name in JOINTS if name[1:] in HAND})
+        model.update_cfg({name: angle for name in JOINTS if name[1:] in FINGER_JOINTS})
         along = [model.get_transform(tip, wrist)[:3, 0] for tip in tips]
         reach[angle] = [axis[0] for axis in along]
     curled, stretched = reach.values()

@@ -29,6 +29,16 @@ STEPS = 16
 """Actions of each recorded episode."""
 
 
+def blind(task: str) -> Any:
+    """Make a task without pictures."""
+    return gym.make(
+        task,
+        obs_mode="state_dict",
+        control_mode="pd_joint_target_delta_pos",
+        render_backend="none",
+    )
+
+
 # -- ManiSkill's recordings and their replay -------------------------------------------
 
 
@@ -48,13 +58,9 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     words = (*VOCABULARY, "plum", "lemon", "not")
     register(Experiment("RecordFruit-v1", (lemon, plum), sentences, vocabulary=words))
     folder = tmp_path_factory.mktemp("recorded")
-    env = gym.make(
-        "RecordFruit-v1",
-        obs_mode="state_dict",
-        control_mode="pd_joint_target_delta_pos",
-        render_backend="none",
+    env = RecordEpisode(
+        blind("RecordFruit-v1"), str(folder), trajectory_name="fruit", save_video=False
     )
-    env = RecordEpisode(env, str(folder), trajectory_name="fruit", save_video=False)
     rng = np.random.default_rng(5)  # touches the right object in two of the three
     starts = (3, {"instruction": 1}), (None, {}), (None, {"reconfigure": True})
     for seed, options in starts:
@@ -126,12 +132,7 @@ def test_replayed_states_are_those_recorded(recorded: Path) -> None:
 
 @pytest.mark.slow
 def test_a_row_of_a_recording_restores_the_whole_state(recorded: Path) -> None:
-    env: Any = gym.make(
-        "RecordFruit-v1",
-        obs_mode="state_dict",
-        control_mode="pd_joint_target_delta_pos",
-        render_backend="none",
-    ).unwrapped
+    env = blind("RecordFruit-v1").unwrapped
     env.reset(seed=0, options={"instruction": 0})
     with h5py.File(recorded) as file:
         rows = dict_to_list_of_dicts(file["traj_0/env_states"])
@@ -145,16 +146,6 @@ def test_a_row_of_a_recording_restores_the_whole_state(recorded: Path) -> None:
 
 
 # -- Resets to a state -----------------------------------------------------------------
-
-
-def blind(task: str) -> Any:
-    """Make a task without pictures."""
-    return gym.make(
-        task,
-        obs_mode="state_dict",
-        control_mode="pd_joint_target_delta_pos",
-        render_backend="none",
-    )
 
 
 @pytest.fixture(scope="module", params=["NaoTouchCubeShuffled-v1", "NaoInstruct-v1"])
@@ -231,19 +222,6 @@ def test_flattening_keeps_the_tokens_last_as_plain_numbers() -> None:
     assert not terminated.any()
     assert info["final_info"]["episode"]["episode_len"].tolist() == [32]
     assert not torch.equal(info["final_observation"]["state"], obs["state"])
-    envs.close()
-
-
-def test_the_state_layout_starts_anew_by_itself() -> None:
-    env = gym.make("NaoTouchCubeMulti-v1", obs_mode="state", render_backend="none")
-    envs = ManiSkillVectorEnv(env, ignore_terminations=True, record_metrics=True)
-    obs, _ = envs.reset(seed=0)
-    width = 26 * 3 + 6 + 5 + 9 + 18 + 3 + 6 + 1 + 1
-    assert envs.single_observation_space.shape == obs.shape[1:] == (width,)
-    for _ in range(33):
-        obs, _, _, _, info = envs.step(envs.action_space.sample())
-    assert tuple(obs.shape) == (1, width)
-    assert info["elapsed_steps"].tolist() == [1]
     envs.close()
 
 

@@ -231,3 +231,10 @@ def test_a_field_that_cannot_be_stacked_is_refused():
 
     with pytest.raises(GoalError, match="field 'song' of a goal: got 'la', expected"):
         GoalTable([Sing(RED)], HANDS, CPU)
+
+    @dataclasses.dataclass(frozen=True)
+    class Lift(Avoid):
+        direction: str = "up"
+
+    with pytest.raises(GoalError, match="direction of a goal: got 'up', available: l"):
+        GoalTable([Lift(RED)], HANDS, CPU)

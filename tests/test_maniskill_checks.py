@@ -78,7 +78,7 @@ def test_a_seed_gives_the_same_sequence_of_episodes(env: gym.Env) -> None:
     short = gym.wrappers.TimeLimit(env.unwrapped, 3)
     actions, ends = [env.action_space.sample() for _ in range(7)], []
     for _ in range(2):
-        short.reset(seed=2000)
+        short.reset(seed=np.int64(2000))
         for action in actions:
             obs, _, _, truncated, _ = short.step(action)
             if truncated:

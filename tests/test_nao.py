@@ -28,14 +28,6 @@ def env(request: pytest.FixtureRequest) -> Iterator[TouchEnv]:
     env.close()
 
 
-def action(env: TouchEnv, **joints: float) -> np.ndarray:
-    """Return an action that is 0 but for the named joints."""
-    row = np.zeros(26, np.float32)
-    for name, value in joints.items():
-        row[JOINTS.index(name)] = value
-    return row
-
-
 def test_actions_are_26_joints_all_left_then_all_right(env: TouchEnv) -> None:
     assert env.action_space.shape == (26,)
     assert (env.action_space.low == -1).all()
@@ -79,37 +71,16 @@ def test_proprioception_is_within_bounds_even_at_the_limits(env: TouchEnv) -> No
         for felt in ("proprioception", "target"):
             assert obs["agent"][felt].abs().max() <= 1
         assert (obs["agent"]["target"] * sign).min() > 0.999
+    if env.control_mode == DELTA:  # targets have not wound up
+        back = env.step(np.ones(26, np.float32))[0]["agent"]["target"]
+        torch.testing.assert_close(back, torch.full((1, 26), -1 + 0.2))
 
 
-def test_delta_targets_do_not_wind_up() -> None:
-    with gym.make(
-        "NaoTouchButtonTriangle-v1",
-        obs_mode="state_dict",
-        control_mode=DELTA,
-        render_backend="none",
-    ) as made:
-        env = made.unwrapped
-        env.reset(seed=0)
-        up = action(env, LWristYaw=1)
-        for _ in range(30):
-            env.step(up)
-        obs = env.step(-up)[0]
-        target = obs["agent"]["target"][0, JOINTS.index("LWristYaw")]
-        assert target.item() == pytest.approx(1 - 0.2, abs=1e-5)
-
-
-def test_a_reset_to_a_state_restores_its_targets_too(env: TouchEnv) -> None:
+def test_a_control_mode_has_targets_as_soon_as_it_is_set(env: TouchEnv) -> None:
     env.reset(seed=0)
-    for row in np.random.default_rng(0).uniform(-1, 1, (5, 26)).astype(np.float32):
-        env.step(row)
-    wanted = env.agent.controller.target.clone()
-    for state in (env.get_state_dict(), env.get_state()):
-        env.reset()  # to other targets
-        env.reset(options={"reset_to_env_states": {"env_states": state}})
-        assert torch.equal(env.agent.controller.target, wanted)
-    env.reset()
-    qpos = env.agent.robot.get_qpos()[:, env.agent.controller.active_joint_indices]
-    torch.testing.assert_close(env.agent.controller.target, qpos)
+    env.agent.set_control_mode(DELTA if env.control_mode == ABSOLUTE else ABSOLUTE)
+    assert env.get_state_dict()["controller"]["target_qpos"].shape == (1, 26)
+    env.agent.set_control_mode()
 
 
 def test_of_a_batch_the_envs_being_reset_alone_get_new_targets() -> None:

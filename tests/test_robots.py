@@ -156,7 +156,9 @@ def test_what_is_out_of_reach_is_refused(robot: type[Robot], far: str) -> None:
 # -- Names ------------------------------------------------------------------
 
 
-def test_robots_have_short_names_that_leave_maniskills_alone() -> None:
+def test_robots_have_short_names_that_leave_others_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     for name, robot in ROBOTS.items():
         assert find_robot(name) == find_robot(robot.uid) == robot.uid
         assert find_robot(robot) is robot
@@ -164,6 +166,8 @@ def test_robots_have_short_names_that_leave_maniskills_alone() -> None:
     for unknown in ("unitree_g1", "moon"):
         with pytest.raises(RobotError, match=f"got '{unknown}'.*nao, .*panda"):
             find_robot(unknown)
+    monkeypatch.setitem(REGISTERED_AGENTS, "g1", REGISTERED_AGENTS["nao"])
+    assert find_robot("g1") == "g1"  # somebody's own
 
 
 # -- Pictures ------------------------------------------------------------------
@@ -219,7 +223,7 @@ def edge(camera: CameraConfig, points: np.ndarray) -> float:
 # -- A robot of one's own --------------------------------------------------------------
 
 BOX = "<collision><geometry><box size='0.02 0.02 0.1'/></geometry></collision>"
-MIRRORED = BOX.replace("box size='0.02 0.02 0.1'", "mesh filename='x' scale='1 -1 1'")
+MESH = BOX.replace("box size='0.02 0.02 0.1'", "mesh filename='x' scale='1 -1 1'")
 INERTIAL = (
     "<inertial><mass value='0.1'/><inertia ixx='1e-3' iyy='1e-3' izz='1e-3' ixy='0' "
     "ixz='0' iyz='0'/></inertial>"
@@ -315,14 +319,18 @@ def test_a_joint_that_is_not_driven_is_held_and_one_that_mimics_is_free(
         (link("arm"), "link 'arm': got two"),
         (joint("lift", "arm", "tip"), "joint 'lift': got two"),
         (link("flag", BOX.replace("0.02 0.02 0.1", "0")), "link 'flag': <box> size"),
-        (link("flag", MIRRORED), "link 'flag': <mesh> scale.*mirror"),
+        (link("flag", BOX.replace("box size", "cone size")), "'flag': <geom.*got cone"),
+        (link("flag", MESH), "link 'flag': <mesh> scale.*mirror"),
+        (link("flag", MESH.replace("1 -1 1", "1")), "got '1', expected three numbers"),
+        (link("flag", MESH.replace("1 -1", "1 1").replace("'x'", "''")), "'filename'"),
+        (link("flag").replace("1e-3", "0"), "'flag': <inertial>.* of inertia 0 0 0"),
+        (link("flag").replace("value='0.1'", "value='-1'"), "got a mass of -1 kg"),
+        (link(""), "a <link> has no name"),
         (joint("spin", "arm", "tip").replace("0 1 0", "0 0 0"), "'spin': <axis>"),
         ("<link>", "not XML"),
     ],
 )
-def test_what_a_driven_joint_lacks_is_named(
-    tmp_path: Path, part: str, named: str
-) -> None:
+def test_what_a_file_lacks_is_named(tmp_path: Path, part: str, named: str) -> None:
     path = Path(written(tmp_path, ARM, link("tip"), part))
     with pytest.raises(RobotError, match=f"stick.urdf: .*{named}"):
         read_motors(path, ("lift", "bend_1"))

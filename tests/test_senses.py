@@ -128,6 +128,7 @@ def test_text_comes_back_from_its_bytes() -> None:
 
 def test_text_is_observed_where_it_is_asked_for() -> None:
     kwargs = {"obs_mode": "state_dict", "render_backend": "none"}
+    assert senses.require_askable(name for name in ("text",)) == ("text",)
     env = gym.make("NaoTouchCubeMulti-v1", observe=("text",), **kwargs)
     obs, _ = env.reset(seed=0, options={"instruction": 1})
     env.close()

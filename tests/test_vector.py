@@ -1,7 +1,6 @@
 """Vector envs: same numbers as single envs, ends of episodes, what they are given."""
 
 import copy
-import dataclasses
 import pickle
 import types
 from collections.abc import Iterator
@@ -18,7 +17,6 @@ from gymnasium.wrappers.vector import (
 )
 from trees import leaves
 
-import ir_maniskill
 from ir_maniskill import experiment as catalog
 from ir_maniskill.environment import vector
 from ir_maniskill.environment.process_vector import (
@@ -112,7 +110,9 @@ def test_observations_are_in_the_declared_space(
     obs, _ = envs.reset(seed=0)
     assert obs["extra"]["object_position"].shape == (3, 3, 3)
     assert envs.observation_space.contains(arrays(obs))
-    assert flat.observation_space.contains(arrays(flat.reset(seed=0)[0]))
+    state, _ = flat.reset(seed=0)
+    assert state.shape == (3, 26 * 3 + 6 + 5 + 9 + 18 + 3 + 6 + 1 + 1)
+    assert flat.observation_space.contains(arrays(state))
 
 
 def test_pictures_cross_the_process_border(multi_vec: ProcessVectorEnv) -> None:
@@ -153,17 +153,6 @@ def test_without_a_seed_every_env_has_a_stream_of_its_own(
     assert torch.equal(flat.reset()[0], second)
 
 
-def test_users_own_experiments_reach_the_workers() -> None:
-    triangle = catalog.get(TASK)
-    mine = dataclasses.replace(triangle, id="Mine-v1", episode_steps=4)
-    ir_maniskill.register(mine)
-    envs = make_vec("Mine-v1", 1, sim_backend="physx_cpu", **KWARGS)
-    envs.reset(seed=0)
-    ends = [envs.step(action)[3].item() for action in actions(4, 1)]
-    assert ends == [False, False, False, True]
-    envs.close()
-
-
 # -- Ends of episodes ------------------------------------------------------------------
 
 
@@ -201,16 +190,12 @@ def test_final_rows_of_envs_that_go_on_are_zero(done: list, expected: list) -> N
 # -- What they are given ---------------------------------------------------------------
 
 
-@pytest.mark.parametrize("form", [torch.tensor, np.array, list, tuple])
-def test_instructions_are_dealt_out_one_each(envs: ProcessVectorEnv, form: Any) -> None:
-    assert told(envs, instruction=form([2, 0, 1]), reconfigure=False) == [2, 0, 1]
-    assert told(envs, instruction=form([1, 1, 1])[0]) == [1, 1, 1]
-
-
-def test_instructions_may_be_sentences(envs: ProcessVectorEnv) -> None:
+def test_instructions_are_dealt_out_one_each(envs: ProcessVectorEnv) -> None:
     red, blue = SENTENCES[0], SENTENCES[2]
-    assert told(envs, instruction=blue) == [2, 2, 2]
-    assert told(envs, instruction=[blue, red, blue]) == [2, 0, 2]
+    for form in (torch.tensor, np.array, list, tuple):
+        assert told(envs, instruction=form([2, 0, 1]), reconfigure=False) == [2, 0, 1]
+    for given in (2, np.int64(2), torch.tensor(2), blue):
+        assert told(envs, instruction=given) == [2, 2, 2]
     assert told(envs, instruction=np.array([red, red, blue])) == [0, 0, 2]
     assert told(envs, instruction=(1, red, 2)) == [1, 0, 2]
 
@@ -228,8 +213,16 @@ WRONG_RESETS = [
     ({"options": {"instruction": 1.5}}, "instruction: got 1.5"),
     ({"options": {"instruction": [0, 1]}}, r"got \[0, 1\], .* or a list of 3"),
     ({"options": {"instruction": "Touch."}}, "got 'Touch.'.*, one of .*red cube"),
+    (
+        {"options": {"instruction": "Touch the red cube with your left hand."}},
+        "got 'Touch the red cube with your left hand.', expected at most 5 words",
+    ),
     ({"options": {"reconfigure": 1}}, "'reconfigure': got 1, expected True or False"),
     ({"options": {"reset_to_env_states": torch.zeros(3, 9)}}, "expected {'env_states'"),
+    (
+        {"options": {"reset_to_env_states": {"env_states": {"actors": {}}}}},
+        "got .*'actors'.*, expected .* what get_state or get_state_dict returned",
+    ),
     (
         {"options": {"reset_to_env_states": {"env_states": torch.zeros(2, 9)}}},
         r"\['env_states'\]: got float32 of shape \(2, 9\), expected .* 3 rows",
@@ -255,7 +248,7 @@ def test_wrong_resets_are_refused_and_change_nothing(
 def test_what_only_an_env_can_refuse_leaves_the_others_usable(
     envs: ProcessVectorEnv,
 ) -> None:
-    nobody = {"actors": {"nobody": torch.zeros(3, 13)}}
+    nobody = {"actors": {"nobody": torch.zeros(3, 13)}, "task": {}}
     for states in (nobody, torch.zeros(3, 5)):
         with pytest.raises(WorkerError, match=r"worker-0 \(envs 0 to 1\) failed"):
             envs.reset(options={"reset_to_env_states": {"env_states": states}})
@@ -335,6 +328,7 @@ def test_wrong_actions_are_refused_and_no_env_steps(
         ({"num_workers": 0}, "num_workers: got 0, expected a whole number, at least 1"),
         ({"timeout": 0}, "timeout: got 0, expected more than 0"),
         ({"task_id": None}, "task id: got None, expected a str"),
+        ({"sim_backend": None}, "sim_backend: got None, expected 'auto' or one of"),
         ({"sim_backend": "gpus"}, "sim_backend: got 'gpus', expected 'auto' or one of"),
         ({"task_id": "NoSuchTask-v1"}, "available"),
     ],
@@ -403,8 +397,12 @@ def test_rewards_are_arrays_to_numpy_and_plain_tensors_to_torch(
     envs.reset(seed=0)
     _, reward, terminated, truncated, _ = envs.step(torch.zeros(3, 26))
     either = np.logical_or(terminated, truncated)
-    for array in (either, np.where(either, 0, reward), np.zeros(3) + reward):
+    for array in (
+        *(either, np.where(either, 0, reward), np.zeros(3) + reward),
+        *(np.stack([reward, reward]), np.add(reward, 1, out=reward)),
+    ):
         assert type(array) is np.ndarray
+    assert np.sum(np.ones(3), where=terminated) == 0
     assert np.sum(either) == 0
     assert (1 - terminated).tolist() == [1, 1, 1]
     assert torch.equal(1 - reward, -(reward - 1))

@@ -1,5 +1,6 @@
 """Worker processes that cannot start, fail, die, hang, or are left behind."""
 
+import dataclasses
 import multiprocessing as mp
 import os
 import resource
@@ -16,6 +17,8 @@ import torch
 from mani_skill.agents.registration import register_agent
 from mounts import disk
 
+from ir_maniskill import experiment as catalog
+from ir_maniskill import register
 from ir_maniskill.environment import shared_rows
 from ir_maniskill.environment.process_vector import ProcessVectorEnv, WorkerError
 from ir_maniskill.environment.robots import Nao
@@ -27,7 +30,8 @@ TASK = "NaoTouchCubeSingle-v1"
 def make(num_envs: int, **kwargs) -> ProcessVectorEnv:
     """Make envs without pictures, each in a process of its own."""
     usual = {"obs_mode": "state", "render_backend": "none", "sim_backend": "physx_cpu"}
-    return make_vec(TASK, num_envs, **{"num_workers": num_envs} | usual | kwargs)
+    usual |= {"task_id": TASK, "num_workers": num_envs}
+    return make_vec(num_envs=num_envs, **usual | kwargs)
 
 
 def alive(pid: int) -> bool:
@@ -144,8 +148,12 @@ class Twin(Nao):
     uid = "twin"
 
 
-def test_a_robot_of_ones_own_reaches_workers_by_its_name() -> None:
-    envs = make(1, robot_uids="twin")
+def test_a_task_and_a_robot_of_ones_own_reach_workers() -> None:
+    mine = dataclasses.replace(catalog.get(TASK), id="Mine-v1", episode_steps=2)
+    register(mine)
+    envs = make(1, task_id="Mine-v1", robot_uids="twin")
+    envs.reset(seed=0)
+    assert [envs.step(torch.zeros(1, 26))[3].item() for _ in range(2)] == [False, True]
     assert envs.get_attr("robot_uids") == ("twin",)
     envs.close()
 
@@ -189,6 +197,8 @@ def test_a_hanging_worker_is_named_instead_of_waited_for() -> None:
     os.kill(pid, signal.SIGSTOP)
     envs.close()
     assert not alive(pid)
+    with pytest.raises(WorkerError, match="nothing to wait for"):
+        envs.step_wait()
 
 
 @pytest.mark.slow

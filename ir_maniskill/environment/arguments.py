@@ -11,9 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ir_maniskill.environment.senses import text_of
 from ir_maniskill.experiment import Experiment, Spoken
-from ir_maniskill.goals import Instruction
-from ir_maniskill.language import SentenceError, parse
+from ir_maniskill.goals import GoalError, Instruction
+from ir_maniskill.language import SentenceError, handwritten, parse
+from ir_maniskill.language.tokens import split_words
 
 RESET_OPTIONS = ("instruction", "reconfigure", "reset_to_env_states")
 """Names of the options that a reset of all envs takes."""
@@ -49,12 +51,14 @@ def instructions_of(
 
     Raises:
         ValueError: It is something else, or a sentence that is not understood.
+        GoalError: A sentence is too long for what envs observe.
     """
     given, hint = _plain(given), ""
     each = given if isinstance(given, list) else [given] * num_envs
     try:
         found = [_instruction(one, experiment) for one in each]
         if len(found) == num_envs:
+            _require_short([one.text for one in found], experiment.max_tokens)
             return found
     except SentenceError as error:
         hint = f" ({error})"
@@ -71,15 +75,26 @@ def instructions_of(
 def _instruction(given: Any, experiment: Experiment) -> Instruction:
     """Return what is meant; SentenceError or LookupError: nothing."""
     own = experiment.instructions
-    own = () if isinstance(own, Spoken) else own
+    if isinstance(own, Spoken):  # those of no grammar are said in one split alone
+        own = handwritten() if own.split == "wording" else ()
     if isinstance(given, Instruction):
         return given
     if isinstance(given, str):
         same = (i for i in own if _bare(i.text) == _bare(given))
         return next(same, None) or Instruction(given, parse(given))
-    if _whole(given) and given in range(len(own)):
+    if _whole(given) and given in range(len(experiment.sentences)):
         return own[given]
     raise LookupError
+
+
+def _require_short(texts: list[str], length: int) -> None:
+    for text in texts:
+        if len(split_words(text)) > length:
+            raise GoalError(
+                f"instruction text: got {text!r}, expected at most {length} words and "
+                "full stops in this task"
+            )
+    text_of(texts)  # refuses those of too many bytes
 
 
 def _bare(sentence: str) -> str:
@@ -137,6 +152,13 @@ def require_reset(options: Any) -> None:
             f"reset options: got 'reset_to_env_states' and instruction {short(told)}, "
             "expected one: a state has its instruction, which `tell` can change after"
         )
+    states = state.get("env_states") if isinstance(state, dict) else None
+    part = isinstance(states, dict) and "task" not in states
+    if "reset_to_env_states" in options and (states is None or part):
+        raise ValueError(
+            f"reset option 'reset_to_env_states': got {short(state)}, expected "
+            "{'env_states': ...} with what get_state or get_state_dict returned"
+        )
 
 
 def _require_dict(options: Any) -> None:
@@ -170,10 +192,7 @@ def _deal(name: str, value: Any, experiment: Experiment, num_envs: int) -> list:
         return instructions_of(value, experiment, num_envs)
     if name != "reset_to_env_states":
         return [value] * num_envs
-    what = f"reset option {name!r}"
-    if not isinstance(value, dict) or "env_states" not in value:
-        raise ValueError(f"{what}: got {short(value)}, expected {{'env_states': ...}}")
-    return [_row(what, value, row, num_envs) for row in range(num_envs)]
+    return [_row(name, value, row, num_envs) for row in range(num_envs)]
 
 
 def _row(what: str, states: Any, row: int, num_envs: int) -> Any:
@@ -189,8 +208,8 @@ def _row(what: str, states: Any, row: int, num_envs: int) -> Any:
     if array.dtype.kind in "biuf" and array.ndim > 1 and len(array) in (1, num_envs):
         return array[row % len(array)][None]
     raise ValueError(
-        f"{what}: got {array.dtype} of shape {array.shape}, expected numbers with "
-        f"{num_envs} rows, one for each env, or a single one for all"
+        f"reset option {what}: got {array.dtype} of shape {array.shape}, expected "
+        f"numbers with {num_envs} rows, one for each env, or a single one for all"
     )
 
 

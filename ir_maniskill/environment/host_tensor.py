@@ -18,12 +18,12 @@ class HostTensor(Tensor):
     __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore
 
     def __array_ufunc__(self, ufunc: Any, way: str, *args: Any, **kwargs: Any) -> Any:
-        return getattr(ufunc, way)(*_arrays(args), **kwargs)
+        return getattr(ufunc, way)(*_arrays(args), **_arrays(kwargs))
 
     def __array_function__(
         self, function: Any, types: Any, args: tuple, kwargs: dict[str, Any]
     ) -> Any:
-        return function(*_arrays(args), **kwargs)
+        return function(*_arrays(args), **_arrays(kwargs))
 
     def __getitem__(self, index: Any) -> Tensor:
         return super().__getitem__(index).as_subclass(HostTensor)
@@ -40,5 +40,10 @@ class HostTensor(Tensor):
         return self.as_subclass(Tensor).__reduce_ex__(protocol)
 
 
-def _arrays(args: tuple) -> list:
-    return [arg.numpy() if isinstance(arg, HostTensor) else arg for arg in args]
+def _arrays(given: Any) -> Any:
+    """Return arguments, however nested, with arrays in place of such tensors."""
+    if isinstance(given, list | tuple):
+        return type(given)(map(_arrays, given))
+    if isinstance(given, dict):
+        return {name: _arrays(value) for name, value in given.items()}
+    return given.numpy() if isinstance(given, HostTensor) else given

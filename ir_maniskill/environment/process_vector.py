@@ -217,7 +217,7 @@ class ProcessVectorEnv(VectorEnv):
             if process.is_alive():
                 process.kill()
                 process.join()
-        self._pipes, self._processes = [], []
+        self._pipes, self._processes, self._busy = [], [], False
         self.__dict__.pop("_shared", None)
 
     # -- Talking to the workers ------------------------------------------------------

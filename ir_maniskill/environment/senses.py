@@ -170,10 +170,10 @@ def require_askable(names: Iterable[str]) -> tuple[str, ...]:
     Raises:
         ValueError: One is not `askable`.
     """
-    many = isinstance(names, Iterable) and not isinstance(names, str)
-    if not many or not set(names) <= set(askable()):
+    asked = tuple(names) if isinstance(names, Iterable) else (names,)
+    if isinstance(names, str) or not all(name in askable() for name in asked):
         raise ValueError(f"observe: got {names!r}, available: {askable()}")
-    return tuple(names)
+    return asked
 
 
 def registered() -> tuple[Term, ...]:

@@ -83,7 +83,7 @@ class Speaker:
             slots[left], places[left] = self.layout.lay_out(np.stack(noise))
             for i in left:
                 there = self._things(slots[i], places[i])
-                if answer := self._answer(wishes[i], there, tried):
+                if there and (answer := self._answer(wishes[i], there, tried)):
                     said[i] = answer
             left = [i for i in left if i not in said]
             if not left:

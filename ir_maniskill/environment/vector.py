@@ -67,7 +67,7 @@ def make_vec(
 
 def _simulator(sim_backend: str) -> str:
     """Return the first of ManiSkill's names of a backend, without the device."""
-    kind, _, _ = sim_backend.partition(":")
+    kind, _, _ = str(sim_backend).partition(":")
     known = ", ".join(sim_backend_name_mapping)
     expected = f"'auto' or one of {known}, with a device if need be ('cuda:0')"
     require(kind in sim_backend_name_mapping, "sim_backend", sim_backend, expected)

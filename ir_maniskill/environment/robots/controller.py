@@ -95,7 +95,7 @@ class TargetController(PDJointPosController):
 
     def get_state(self) -> dict[str, Tensor]:
         """Return the targets: they are state in every control mode."""
-        return {"target_qpos": self._target_qpos.clone()}
+        return {"target_qpos": self.target.clone()}
 
     def set_state(self, state: dict[str, Tensor]) -> None:
         """Restore what `get_state` returned."""

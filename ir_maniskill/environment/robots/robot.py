@@ -81,7 +81,7 @@ class Robot(BaseAgent, ABC):
     scale: float = 1.0
     """How large table, objects, layout and cameras are, beside NAO's."""
     shoulders: tuple[tuple[float, float], ...]
-    """Where the arms start in the world, seen from above (x, y) [m]."""
+    """Where the arm of each hand starts in the world, seen from above (x, y) [m]."""
     reach: float
     """Farthest that an object may be from a shoulder, seen from above [m]."""
     start_qpos: Tensor
@@ -251,7 +251,12 @@ class Robot(BaseAgent, ABC):
 
         Args:
             action: As the control mode asks, in the order of `joints` [N, J].
+
+        Raises:
+            ValueError: It is not finite (checked on the CPU only).
         """
+        if not self.scene.gpu_sim_enabled and not action.isfinite().all():
+            raise ValueError(f"action: got {action.tolist()}, expected finite numbers")
         self.controller.set_action(action)
 
     def to_qpos(self, position: Tensor) -> Tensor:
@@ -326,7 +331,7 @@ def find_robot(robot: str | type[BaseAgent]) -> str | type[Robot]:
     if isinstance(robot, type) and issubclass(robot, Robot):
         return robot
     uids = available_robots()
-    for uid in uids:
+    for uid in sorted(uids, key=lambda uid: uid != robot):  # its own uid comes first
         if robot in (uid, short_name(uid)):
             return uid
     raise RobotError(
