@@ -15,6 +15,7 @@ from ir_maniskill.evaluation import audit as audits
 from ir_maniskill.evaluation import plots
 from ir_maniskill.evaluation.audit import AuditReport, Row, at_random, blind, controls
 from ir_maniskill.evaluation.evaluate import Rate
+from ir_maniskill.evaluation.scripted import NotScripted
 from ir_maniskill.language.tokens import UNK
 from ir_maniskill.training.checkpoint import MismatchError
 
@@ -133,14 +134,17 @@ def test_each_row_plays_the_same_episodes(monkeypatch, multi_vec, caplog):
 
 
 def test_what_is_not_scripted_has_no_row(monkeypatch, multi_vec, caplog):
-    def refuse(_):
-        raise ValueError("goal: got Spin")
+    def fail(error):
+        raise error
 
-    none = SimpleNamespace(base_env=None, close=lambda: None)
-    monkeypatch.setattr(audits, "blind", lambda *_: none)
-    monkeypatch.setattr(audits, "Scripted", refuse)
+    alone = SimpleNamespace(base_env=NotScripted("goal: got Spin"), close=lambda: None)
+    monkeypatch.setattr(audits, "blind", lambda *_: alone)
+    monkeypatch.setattr(audits, "Scripted", fail)
     assert audits._scripted(multi_vec, [], []) == []
     assert "no scripted solution: goal: got Spin" in caplog.text
+    alone.base_env = ValueError("a fault of ours")
+    with pytest.raises(ValueError, match="a fault of ours"):
+        audits._scripted(multi_vec, [], [])
 
 
 def test_a_report_is_a_table_data_and_a_picture(tmp_path):

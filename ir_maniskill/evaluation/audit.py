@@ -41,7 +41,7 @@ from ir_maniskill.evaluation.evaluate import (
     play,
     score_by_name,
 )
-from ir_maniskill.evaluation.scripted import Scripted
+from ir_maniskill.evaluation.scripted import NotScripted, Scripted
 from ir_maniskill.experiment import Experiment, Spoken
 from ir_maniskill.goals import Goal, Instruction
 from ir_maniskill.language import SPLITS, draw, things
@@ -197,7 +197,7 @@ def _scripted(
         gc.freeze()  # ManiSkill collects garbage whenever it rebuilds a scene
         try:
             figures, _ = play(Scripted(alone.base_env), alone, told, seeds)
-        except ValueError as error:
+        except NotScripted as error:
             log.warning("no scripted solution: %s", error)
             return []
         finally:
