@@ -101,12 +101,14 @@ def audit(
     from what a vector env observes to actions [N, J] in [-1, 1], or have such a method
     `act` and, if it remembers anything, `reset(done)`. What it has as `env_kwargs` goes
     to `make_vec`; without, it sees pictures and its actions change the joints' targets.
-    `episodes` are those of each row, and `num_envs` at least 2.
+    `episodes` are those of each row, `num_envs` at least 2, and all splits are played.
 
     Returns:
         The table: `print` shows it, `evaluation.plots.bars` draws it.
     """
     require_whole("num_envs", num_envs, 2)
+    split = env_kwargs.get("split")
+    require(split is None, "split", split, "none: an audit plays all there are")
     if isinstance(policy, Policy | str | Path):
         robot = env_kwargs.get("robot_uids")
         policy, experiment, _ = _prepare(

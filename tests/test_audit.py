@@ -1,6 +1,7 @@
 """An audit takes away what it says, nothing else, and counts what happens."""
 
 import contextlib
+import dataclasses
 from types import SimpleNamespace
 from typing import ClassVar
 
@@ -85,6 +86,17 @@ def test_another_sentence_is_never_the_true_one(told, instead):
     after = changed("another sentence", observation(told))["extra"]
     assert torch.equal(after["instruction"], TOKENS[[instead, 1]])
     assert read_text(after["text"])[0] == TASK.sentences[instead]
+
+
+def test_another_sentence_has_another_goal():
+    blue, red, _ = TASK.instructions
+    same = dataclasses.replace(blue, text="Touch blue.")
+    task = dataclasses.replace(TASK, id="Same-v1", instructions=(blue, same, red))
+    tokens = tokens_of(task.sentences, task.vocabulary, task.max_tokens)
+    change = controls(task, space_of(observation()))["another sentence"]
+    for told, instead in enumerate((2, 2, 0)):
+        after = change({"extra": {"instruction": tokens[[told]]}})["extra"]
+        assert torch.equal(after["instruction"], tokens[[instead]])
 
 
 def test_other_pictures_are_those_of_the_next_env():
@@ -191,9 +203,11 @@ def test_anybodys_function_is_audited_on_what_envs_observe(monkeypatch):
         ir_maniskill.audit(audits, TASK.id)
 
 
-def test_a_policy_is_not_audited_on_another_robot():
+def test_a_policy_is_not_audited_on_another_robot_or_one_split():
     with pytest.raises(MismatchError, match="robot: got 'nao', expected 'g1'"):
         ir_maniskill.audit(TASK.id, robot_uids="g1")
+    with pytest.raises(ValueError, match="split: got 'pairs', expected none"):
+        ir_maniskill.audit(TASK.id, split="pairs")
 
 
 def test_several_sentences_are_true_of_one_spoken_scene():

@@ -247,7 +247,8 @@ def controls(task: Experiment, space: Any) -> dict[str, Change]:
         found["no joints"] = _with("agent", torch.zeros_like)
     if "instruction" in extra:
         found["no sentence"] = _with("extra", _padding, "instruction", "text")
-        if len(task.sentences) != 1:
+        own = task.instructions
+        if isinstance(own, Spoken) or len({i.goal for i in own}) > 1:
             found["another sentence"] = _another_sentence(task)
         found["words spelt backwards"] = _backwards(task.vocabulary)
     return found
@@ -280,16 +281,19 @@ def _padding(leaf: Tensor) -> Tensor:
 
 
 def _another_sentence(task: Experiment) -> Change:
-    """Return what tells the task's next sentence, or that of another env."""
-    if not task.sentences:
+    """Return what tells the task's next sentence of another goal, or another env's."""
+    if isinstance(task.instructions, Spoken):
         return _with("extra", _of_another, "instruction", "text")
     tokens = tokens_of(task.sentences, task.vocabulary, task.max_tokens)
     text = text_of(task.sentences, TEXT_BYTES)
+    goals = [own.goal for own in task.instructions]
+    turns = [[*range(i, len(goals)), *range(i)] for i in range(len(goals))]
+    others = torch.tensor([next(j for j in t if goals[j] != goals[t[0]]) for t in turns])
 
     def changed(obs: Observation) -> Observation:
         extra, table = obs["extra"], tokens.to(obs["extra"]["instruction"])
         said = (extra["instruction"][:, None] == table).all(dim=2).int().argmax(dim=1)
-        other = (said + 1) % len(table)
+        other = others.to(said)[said]
         new = {"instruction": table[other]}
         if "text" in extra:
             new["text"] = text.to(extra["text"])[other]
