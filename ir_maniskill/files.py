@@ -15,19 +15,20 @@ def replacing(path: Path) -> Iterator[Path]:
     """Yield a new file's path beside `path`; at the end it takes the place of `path`.
 
     Args:
-        path: The file to write. Its folder is made if need be.
+        path: The file to write, maybe through a link. Its folder is made if need be.
 
     Raises:
         OSError: It cannot be written; the file there before is untouched.
     """
-    aside = path.with_name(f".{os.getpid()}.{path.name}")
+    target = path.resolve()
+    aside = target.with_name(f".{os.getpid()}.{target.name}")
     try:
         with writing(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
+            target.parent.mkdir(parents=True, exist_ok=True)
             yield aside
             with aside.open("rb") as file:
                 os.fsync(file.fileno())
-            aside.replace(path)
+            aside.replace(target)
     finally:
         aside.unlink(missing_ok=True)
 
@@ -40,18 +41,21 @@ def write_json(path: Path, data: Any) -> None:
 
 def require_writable(path: Path) -> None:
     """Raise OSError before the work is done whose result could not be written."""
-    new = not path.exists()
+    target = path.resolve()
+    new = not target.exists()
     with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.open("ab").close()
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.open("ab").close()
         if new:
-            path.unlink()
+            target.unlink()
 
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
     """Turn whatever keeps `path` from being written into one clear OSError."""
     try:
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise OSError("it is no file")  # as root one would replace /dev/null
         yield
     except OSError as error:
         reason = error.strerror or error

@@ -8,7 +8,7 @@ import sys
 import pytest
 import torch
 
-from ir_maniskill import api, cli, experiment
+from ir_maniskill import api, cli, experiment, files
 from ir_maniskill.agent.agent import Agent, StateSpec
 from ir_maniskill.policy import load_policy
 from ir_maniskill.training.checkpoint import save_policy
@@ -131,6 +131,17 @@ def test_values_out_of_range_are_refused(arguments, message, capsys, policy_file
     if arguments[0] in ("evaluate", "video"):
         arguments = [*arguments, "--checkpoint", str(policy_file)]
     assert message in fails(capsys, *arguments)
+
+
+def test_what_is_no_file_is_not_replaced_and_a_link_stays(tmp_path):
+    pipe, link, file = (tmp_path / name for name in ("pipe", "link", "file"))
+    os.mkfifo(pipe)
+    link.symlink_to(file)
+    for write in (files.require_writable, lambda path: files.write_json(path, {})):
+        with pytest.raises(OSError, match="cannot write .*pipe: it is no file"):
+            write(pipe)
+        write(link)
+    assert pipe.is_fifo() and link.is_symlink() and file.read_text() == "{}\n"
 
 
 @pytest.mark.parametrize("arguments", [[], ["dance"], ["train"], ["evaluate"]])
