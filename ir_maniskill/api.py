@@ -25,7 +25,6 @@ from ir_maniskill.evaluation.evaluate import (
     player_of,
 )
 from ir_maniskill.experiment import Experiment
-from ir_maniskill.files import require_writable
 from ir_maniskill.policy import Policy, load_policy
 
 PolicyLike = Policy | str | Path
@@ -164,16 +163,14 @@ def record(
     the sentences take turns, and `speed` is 0.05 to 4, of which 1 is real time.
 
     Raises:
-        OSError: The film cannot be written.
+        OSError: The film cannot be written; this is found before anything is played.
     """
     path = Path(path)
-    video.check_name(path)
     plays = isinstance(speed, float | int) and 0.05 <= speed <= 4
     require(plays, "speed", speed, "0.05 to 4")
     policy, experiment, chosen = _prepare(
         policy, task, any_task, episodes, seed, instruction
     )
-    require_writable(path)
     steps = video.record(
         policy.agent.policy,
         experiment.id,

@@ -182,13 +182,14 @@ class Audit(_Play):
     json: Path | None = None
     """File to write the table to."""
     picture: Path | None = None
-    """File to draw it to (.png)."""
+    """File to draw it to (.png, .pdf, .svg)."""
 
     def run(self) -> None:
         """Print the table, write and draw it."""
-        for path in (self.json, self.picture):
-            if path is not None:
-                require_writable(path)
+        if self.json is not None:
+            require_writable(self.json)
+        if self.picture is not None:
+            require_writable(self.picture, plots.ENDINGS)
         policy = _function(self.policy) if self.policy else self.policy_file()
         options = self.options("episodes", "num_envs")
         report = api.audit(policy, catalog.get(self.env_id).id, **options)
@@ -268,8 +269,7 @@ class Talk:
                 "pip install 'ir-maniskill[talk]'"
             ) from None
         if self.record is not None:
-            video.check_name(self.record)
-            require_writable(self.record)
+            require_writable(self.record, video.ENDINGS)
         live.run(
             Session(
                 catalog.get(self.env_id).id,
@@ -286,7 +286,7 @@ class Talk:
 
 @dataclasses.dataclass(frozen=True)
 class Curve:
-    """Draw the learning curve of a run (.png)."""
+    """Draw the learning curve of a run (.png, .pdf, .svg)."""
 
     folder: Positional[Annotated[Path, arg(metavar="FOLDER")]]
     """Folder of the run."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +39,16 @@ def write_json(path: Path, data: Any) -> None:
         aside.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
 
 
-def require_writable(path: Path) -> None:
-    """Raise OSError before the work is done whose result could not be written."""
+def require_writable(path: Path, endings: Sequence[str] = ()) -> None:
+    """Refuse a path before the work is done whose result could not be written there.
+
+    Raises:
+        ValueError: The name has none of the endings, such as ".png".
+        OSError: It cannot be written.
+    """
+    if endings and path.suffix.lower() not in endings:
+        expected = f"a name ending in {' or '.join(endings)}"
+        raise ValueError(f"file: got {path}, expected {expected}")
     target = path.resolve()
     new = not target.exists()
     with writing(path):

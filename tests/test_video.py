@@ -4,6 +4,7 @@ from pathlib import Path
 import imageio.v2 as imageio
 import numpy as np
 import pytest
+from PIL import Image
 
 from ir_maniskill.checks import ConfigError
 from ir_maniskill.environment.robots.nao import HANDS
@@ -127,6 +128,20 @@ def test_videos_play_and_hold_their_last_frame(name, size, tmp_path):
     # GIF merges equal frames into one that lasts longer.
     assert len(frames) == (5 if name.endswith("gif") else 5 + 5)
     assert not np.array_equal(frames[0], frames[4])
+
+
+@pytest.mark.parametrize("speed, frames", [(0.7, 12), (2.0, 12), (4.0, 6)])
+def test_a_gif_is_as_fast_as_browsers_can_show(speed, frames, tmp_path):
+    path = tmp_path / "a.gif"
+    shots = [snapshot(step=0, right=[step % 6]) for step in range(12)]
+    write_video(path, shots, speed=speed)
+    film = Image.open(path)
+    times = []  # [ms]
+    for frame in range(film.n_frames):
+        film.seek(frame)
+        times.append(film.info["duration"])
+    assert len(times) == frames and min(times) >= 20
+    assert sum(times) == pytest.approx(1000 * 12 / (20 * speed), abs=5)
 
 
 def test_a_gif_keeps_the_colors_of_small_things(tmp_path):
@@ -268,6 +283,9 @@ def test_learning_curve_draws_a_run(tmp_path):
 def test_learning_curve_of_no_run_or_a_broken_one_says_so(tmp_path):
     with pytest.raises(ConfigError, match=r"no metrics.csv"):
         plots.learning_curve(tmp_path)
+    write_metrics(tmp_path, "metrics.csv", [{"steps": 1, "train/return": 1}])
+    with pytest.raises(ValueError, match="got curve, expected a name ending in .png"):
+        plots.learning_curve(tmp_path, Path("curve"))
     (tmp_path / "metrics.csv").write_text("steps,train/return\n1,many\n")
     with pytest.raises(ConfigError, match="expected a table of numbers"):
         plots.learning_curve(tmp_path)

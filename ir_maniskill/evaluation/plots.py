@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from ir_maniskill.checks import ConfigError
 from ir_maniskill.evaluation.audit import AuditReport
-from ir_maniskill.files import replacing
+from ir_maniskill.files import replacing, require_writable
 from ir_maniskill.training.run_folder import whole_rows
 
 Row = Mapping[str, float]
@@ -24,6 +24,8 @@ SHARES = (
     ("holding", "steps in which it holds", "#9aa3b2"),
 )
 """What metrics.csv and evaluations.csv have shares of, its name and its color."""
+ENDINGS = (".png", ".pdf", ".svg")
+"""Of the names of pictures."""
 INK = "#24292f"
 """Axes and text."""
 
@@ -39,7 +41,7 @@ def learning_curve(run: Path, out: Path | None = None) -> Path:
         out: Picture to write; None: learning_curve.png in the folder.
 
     Raises:
-        ConfigError: The folder holds no metrics.
+        ValueError: The folder holds no metrics, or `out` is no name of a picture.
     """
     metrics = _read(run / "metrics.csv")
     if not metrics:
@@ -141,6 +143,7 @@ def _style(axes: Axes, grid: Literal["x", "y"]) -> None:
 
 
 def _save(figure: Figure, path: Path) -> Path:
+    require_writable(path, ENDINGS)
     with replacing(path) as aside:
         figure.savefig(aside)
     return path
