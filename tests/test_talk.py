@@ -387,6 +387,13 @@ def test_the_page_listens_here_alone_and_shares_nothing(page):
         assert b"root:" not in line.recv(65536)
 
 
+def test_where_nobody_can_listen_there_is_no_page():
+    with pytest.raises(ValueError, match="port: got 65536, expected a whole number"):
+        Page(None, "127.0.0.1", 65536)
+    with pytest.raises(ValueError, match="host: got '192.0.2.1', expected an address"):
+        Page(None, "192.0.2.1", 8080)
+
+
 @pytest.mark.render
 def test_bodies_are_drawn_on_their_way(page, session):
     go_on(session, 2)
