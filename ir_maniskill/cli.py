@@ -21,7 +21,7 @@ from tyro.conf import Positional, arg, subcommand
 
 from ir_maniskill import api, bench, doctor
 from ir_maniskill import experiment as catalog
-from ir_maniskill.checks import ConfigError
+from ir_maniskill.checks import ConfigError, require
 from ir_maniskill.environment.robots.robot import Robot, available_robots, short_name
 from ir_maniskill.evaluation import plots, video
 from ir_maniskill.evaluation.evaluate import EVALUATION_SEED, write_report
@@ -190,6 +190,9 @@ class Audit(_Play):
             require_writable(self.json)
         if self.picture is not None:
             require_writable(self.picture, plots.ENDINGS)
+        both = f"{self.policy} and {self.checkpoint}"
+        alone = self.policy is None or self.checkpoint is None
+        require(alone, "--policy and --checkpoint", both, "one of them")
         policy = _function(self.policy) if self.policy else self.policy_file()
         options = self.options("episodes", "num_envs")
         report = api.audit(policy, catalog.get(self.env_id).id, **options)

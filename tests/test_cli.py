@@ -117,6 +117,7 @@ def test_an_unknown_instruction_lists_those_there_are(capsys, policy_file):
         (["video", IDS[0], "--speed", "0"], "speed: got 0"),
         (["video", IDS[0], "--out", "film.avi"], "film.avi"),
         (["audit", IDS[0], "--picture", "bars"], "got bars, expected a name ending"),
+        (["audit", IDS[0], "--policy", "a:b", "--checkpoint", "c"], "got 'a:b and c'"),
         (["video", IDS[0], "--seed", str(2**32 - 2)], "seed: got 4294967294"),
         (["evaluate", IDS[0], "--seed", str(2**32 - 100)], "seed: got 4294967196"),
         (["train", IDS[0], "--num-envs", "0"], "num_envs: got 0"),
