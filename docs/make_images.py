@@ -44,19 +44,14 @@ LAYOUTS = {
     "Shuffled": "colors change places",
 }
 """What tells the tasks apart."""
-FILMS = (
-    "NaoTouchCubeSingle-v1",
-    "NaoTouchCubeMulti-v1",
-    "NaoTouchCubeTriangle-v1",
-    "NaoTouchCubeShuffled-v1",
-    "NaoTouchButtonMulti-v1",
-    "NaoTouchButtonTriangle-v1",
-    "NaoTouchButtonShuffled-v1",
-    "NaoInstruct-v1",
-)
-"""The tasks of which there is a film."""
 SHUFFLED = "NaoTouchCubeShuffled-v1"
 SPOKEN = "NaoInstruct-v1"
+FILMS = (
+    *(f"NaoTouchCube{layout}-v1" for layout in LAYOUTS),
+    *(f"NaoTouchButton{layout}-v1" for layout in LAYOUTS if layout != "Single"),
+    SPOKEN,
+)
+"""The tasks of which there is a film."""
 SCENE, TOLD = (
     2_100_009,
     (
