@@ -49,14 +49,6 @@ def script(name: str) -> str:
 
 @pytest.mark.render
 @pytest.mark.slow
-def test_random_actions_leave_a_film(tmp_path: Path) -> None:
-    out = run(tmp_path, script("random_actions.py"), "--episodes", "1")
-    assert re.match(r"Touch the (blue|red|green) cube\. +(not )?touched", out)
-    assert len(list(tmp_path.glob("runs/random_actions/*.mp4"))) == 1
-
-
-@pytest.mark.render
-@pytest.mark.slow
 def test_vector_envs_finish_two_episodes_each(tmp_path: Path) -> None:
     out = run(tmp_path, script("vector_envs.py"), "--num-envs", "2")
     assert len(re.findall(r"\d of 2 touched", out)) == 2
