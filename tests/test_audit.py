@@ -16,7 +16,7 @@ from ir_maniskill.evaluation import audit as audits
 from ir_maniskill.evaluation import plots
 from ir_maniskill.evaluation.audit import AuditReport, Row, at_random, blind, controls
 from ir_maniskill.evaluation.evaluate import Rate
-from ir_maniskill.evaluation.scripted import NotScripted
+from ir_maniskill.evaluation.scripted import NotScriptedError
 from ir_maniskill.language.tokens import UNK
 from ir_maniskill.training.checkpoint import MismatchError
 
@@ -149,7 +149,9 @@ def test_what_is_not_scripted_has_no_row(monkeypatch, multi_vec, caplog):
     def fail(error):
         raise error
 
-    alone = SimpleNamespace(base_env=NotScripted("goal: got Spin"), close=lambda: None)
+    alone = SimpleNamespace(
+        base_env=NotScriptedError("goal: got Spin"), close=lambda: None
+    )
     monkeypatch.setattr(audits, "blind", lambda *_: alone)
     monkeypatch.setattr(audits, "Scripted", fail)
     assert audits._scripted(multi_vec, [], []) == []

@@ -41,7 +41,7 @@ from ir_maniskill.evaluation.evaluate import (
     play,
     score_by_name,
 )
-from ir_maniskill.evaluation.scripted import NotScripted, Scripted
+from ir_maniskill.evaluation.scripted import NotScriptedError, Scripted
 from ir_maniskill.experiment import Experiment, Spoken
 from ir_maniskill.goals import Goal, Instruction
 from ir_maniskill.language import SPLITS, draw, things
@@ -197,7 +197,7 @@ def _scripted(
         gc.freeze()  # ManiSkill collects garbage whenever it rebuilds a scene
         try:
             figures, _ = play(Scripted(alone.base_env), alone, told, seeds)
-        except NotScripted as error:
+        except NotScriptedError as error:
             log.warning("no scripted solution: %s", error)
             return []
         finally:
@@ -287,8 +287,7 @@ def _another_sentence(task: Experiment) -> Change:
     tokens = tokens_of(task.sentences, task.vocabulary, task.max_tokens)
     text = text_of(task.sentences, TEXT_BYTES)
     goals = [own.goal for own in task.instructions]
-    turns = [[*range(i, len(goals)), *range(i)] for i in range(len(goals))]
-    others = torch.tensor([next(j for j in t if goals[j] != goals[t[0]]) for t in turns])
+    others = torch.tensor([_next_other(goals, i) for i in range(len(goals))])
 
     def changed(obs: Observation) -> Observation:
         extra, table = obs["extra"], tokens.to(obs["extra"]["instruction"])
@@ -300,6 +299,12 @@ def _another_sentence(task: Experiment) -> Change:
         return {**obs, "extra": {**extra, **new}}
 
     return changed
+
+
+def _next_other(goals: Sequence[Goal], place: int) -> int:
+    """Return the place of the next goal, round and round, that is another one."""
+    turn = (*range(place, len(goals)), *range(place))
+    return next(i for i in turn if goals[i] != goals[place])
 
 
 def _backwards(vocabulary: tuple[str, ...]) -> Change:

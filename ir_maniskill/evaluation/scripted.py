@@ -74,7 +74,7 @@ FAST, AHEAD = 0.35, 0.6
 """Largest change of the numbers in a step, and lead over where they are [rad]."""
 
 
-class NotScripted(ValueError):
+class NotScriptedError(ValueError):
     """A robot or a goal that the scripted solution cannot play."""
 
 
@@ -112,7 +112,7 @@ class Arm:
         """Read a hand's kinematics, and try random postures to start searches from.
 
         Raises:
-            NotScripted: The fingers have no joints.
+            NotScriptedError: The fingers have no joints.
         """
         self.scale, fingers = robot.scale, robot.hands[hand]
         articulation = robot.robot
@@ -126,7 +126,7 @@ class Arm:
         moved = [articulation.joints_map[j].child_link.name for j in robot.joints]
         distal = set(itertools.chain(*chains)) - set(upper)
         if not distal.intersection(moved):
-            raise NotScripted(
+            raise NotScriptedError(
                 f"hand {hand!r} of {robot.uid!r}: got stiff fingers, expected joints"
             )
         self.joints = np.array([i for i, name in enumerate(moved) if name in upper])
@@ -336,14 +336,14 @@ def acts_in(goal: Goal) -> list[Touch | Push]:
     """Return what is to be done at the same time.
 
     Raises:
-        NotScripted: There is a verb that is not scripted.
+        NotScriptedError: There is a verb that is not scripted.
     """
     if isinstance(goal, Touch | Push):
         return [goal]
     if isinstance(goal, Avoid):
         return []
     if not goal.parts:
-        raise NotScripted(
+        raise NotScriptedError(
             f"goal: got {goal}, expected Touch, Push, Avoid, Both or Then of these"
         )
     return [act for part in goal.parts for act in acts_in(part)]
@@ -466,7 +466,7 @@ class Scripted:
         """Return which hand does what: those that reach it best.
 
         Raises:
-            NotScripted: There is more to do than there are hands.
+            NotScriptedError: There is more to do than there are hands.
         """
         for _ in range(view.stage):
             goal = goal.b if isinstance(goal, Then) else goal
@@ -483,7 +483,7 @@ class Scripted:
             if rated.keys() >= set(enumerate(way))
         ]
         if not ways:
-            raise NotScripted(
+            raise NotScriptedError(
                 f"goal: got {goals}, expected a hand for each, of {[*self.arms]}"
             )
         return min(ways, key=lambda way: sum(act.miss for act in way.values()))
