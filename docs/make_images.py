@@ -1,7 +1,7 @@
 """Renders the README's pictures and films from the project's own tasks and policies.
 
 python docs/make_images.py                           # all
-python docs/make_images.py nao NaoTouchCubeMulti-v1  # these
+python docs/make_images.py tasks NaoTouchCubeMulti-v1  # these
 """
 
 import argparse
@@ -9,6 +9,7 @@ import csv
 import io
 import textwrap
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from itertools import chain
@@ -23,8 +24,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 import ir_maniskill  # noqa: F401 - registers the tasks
 from ir_maniskill import experiment as catalog
-from ir_maniskill.environment.senses import cameras
 from ir_maniskill.evaluation.evaluate import EVALUATION_SEED
+from ir_maniskill.evaluation.plots import style_axes
 from ir_maniskill.evaluation.video import Snapshot, record, write_video
 from ir_maniskill.language import SPLITS
 from ir_maniskill.policy import load_policy
@@ -33,10 +34,9 @@ FOLDER = Path(__file__).parent / "images"
 PAGE, INK, FAINT = (18, 20, 24), (238, 240, 244), (150, 156, 168)
 GAP = 16
 """Between pictures [pixel]."""
-CLOSE = ((0.74, 0.34, 0.40), (0.06, 0.0, 0.08))
-"""Eye and target of the picture of the robot [m]."""
 ABOVE = ((0.56, 0.0, 0.62), (0.12, 0.0, 0.05))
-"""Eye and target of the pictures of the tasks [m]."""
+NEAR = ((0.60, 0.0, 0.52), (0.13, 0.0, 0.03))
+"""Eye and target of the pictures of the tasks, and of the language's scenes [m]."""
 LAYOUTS = {
     "Single": "one sentence",
     "Multi": "three sentences",
@@ -44,19 +44,14 @@ LAYOUTS = {
     "Shuffled": "colors change places",
 }
 """What tells the tasks apart."""
-FILMS = (
-    "NaoTouchCubeSingle-v1",
-    "NaoTouchCubeMulti-v1",
-    "NaoTouchCubeTriangle-v1",
-    "NaoTouchCubeShuffled-v1",
-    "NaoTouchButtonMulti-v1",
-    "NaoTouchButtonTriangle-v1",
-    "NaoTouchButtonShuffled-v1",
-    "NaoInstruct-v1",
-)
-"""The tasks of which there is a film."""
 SHUFFLED = "NaoTouchCubeShuffled-v1"
 SPOKEN = "NaoInstruct-v1"
+FILMS = (
+    *(f"NaoTouchCube{layout}-v1" for layout in LAYOUTS),
+    *(f"NaoTouchButton{layout}-v1" for layout in LAYOUTS if layout != "Single"),
+    SPOKEN,
+)
+"""The tasks of which there is a film."""
 SCENE, TOLD = (
     2_100_009,
     (
@@ -84,9 +79,9 @@ FAILURE = (EVALUATION_SEED + 30, 2)
 
 
 def shoot(
-    task: str, size: tuple[int, int], seen_from: tuple = CLOSE, seed: int = 1
-) -> tuple[Image.Image, list[Image.Image]]:
-    """Return the human view of a task's start, and what the two cameras see."""
+    task: str, size: tuple[int, int], seen_from: tuple, seed: int, **kwargs: Any
+) -> tuple[Image.Image, str]:
+    """Return the human view of an episode's start, and what is said."""
     width, height = size
     camera = {
         "width": 2 * width,  # drawn large and shrunk, for smooth edges
@@ -94,21 +89,16 @@ def shoot(
         "pose": look_at(*seen_from),
         "fov": 0.56,
     }
-    env: Any = gym.make(
-        task,
-        obs_mode="rgb",
-        render_mode="rgb_array",
-        enable_shadow=True,
-        human_render_camera_configs=camera,
-    )
-    obs, _ = env.reset(seed=seed, options={"instruction": 0})
-    view = Image.fromarray(env.render()[0].cpu().numpy()).resize(size)
-    eyes = [
-        Image.fromarray(obs["sensor_data"][name]["rgb"][0].cpu().numpy())
-        for name in cameras(obs)
-    ]
-    env.close()
-    return view, eyes
+    kwargs |= {"render_mode": "rgb_array", "human_render_camera_configs": camera}
+    env: Any = gym.make(task, enable_shadow=True, **kwargs)
+    with closing(env):
+        env.reset(seed=seed)
+        if task == SPOKEN:  # objects may lie under the hands
+            rest = torch.as_tensor(env.unwrapped.agent.keyframes["rest"].qpos)
+            env.unwrapped.agent.robot.set_qpos(rest[None])
+        view = Image.fromarray(env.render()[0].cpu().numpy()).resize(size)
+        (said,) = env.unwrapped.get_language_instruction()
+    return view, said
 
 
 def label(page: Image.Image, place: tuple[int, int], text: str, size: int) -> None:
@@ -116,19 +106,6 @@ def label(page: Image.Image, place: tuple[int, int], text: str, size: int) -> No
     font: Any = ImageFont.load_default(size)
     ink = INK if size > 20 else FAINT
     ImageDraw.Draw(page).text(place, text, ink, font, anchor="lm")
-
-
-def hero() -> Image.Image:
-    """Return the triangle scene beside what the policy sees of it."""
-    view, eyes = shoot("NaoTouchCubeTriangle-v1", (832, 512))
-    page = Image.new("RGB", (GAP + 832 + 2 * (GAP + 256) + GAP, 64 + 512 + GAP), PAGE)
-    label(page, (GAP, 32), "“Touch the blue cube.”", 26)
-    page.paste(view, (GAP, 64))
-    for index, (name, eye) in enumerate(zip(("top", "front"), eyes, strict=True)):
-        left = GAP + 832 + GAP + index * (256 + GAP)
-        label(page, (left, 46), f"{name} camera", 14)
-        page.paste(eye, (left, 64))
-    return page
 
 
 def scenes() -> Image.Image:
@@ -158,30 +135,12 @@ def instruct() -> Image.Image:
         label(page, (GAP, top + 12), split, 16)
         for column in range(columns):
             left = GAP + column * (width + GAP)
-            view, said = glimpse(split, (width, height), seed=columns * row + column)
+            seed, kwargs = columns * row + column, {"split": split}
+            view, said = shoot(SPOKEN, (width, height), NEAR, seed, **kwargs)
             page.paste(view, (left, top + 24))
             for line, words in enumerate(textwrap.wrap(said, 44)[:3]):
                 label(page, (left, top + 24 + height + 10 + 15 * line), words, 13)
     return page
-
-
-def glimpse(split: str, size: tuple[int, int], seed: int) -> tuple[Image.Image, str]:
-    """Return a scene of a split of the language, and what is said."""
-    camera = {
-        "width": 2 * size[0],
-        "height": 2 * size[1],
-        "pose": look_at((0.60, 0.0, 0.52), (0.13, 0.0, 0.03)),
-        "fov": 0.56,
-    }
-    kwargs = {"render_mode": "rgb_array", "human_render_camera_configs": camera}
-    env: Any = gym.make("NaoInstruct-v1", split=split, enable_shadow=True, **kwargs)
-    env.reset(seed=seed)
-    rest = torch.as_tensor(env.unwrapped.agent.keyframes["rest"].qpos)
-    env.unwrapped.agent.robot.set_qpos(rest[None])  # hands off the objects
-    view = Image.fromarray(env.render()[0].cpu().numpy()).resize(size)
-    (said,) = env.unwrapped.get_language_instruction()
-    env.close()
-    return view, said
 
 
 def curves() -> Image.Image:
@@ -191,8 +150,7 @@ def curves() -> Image.Image:
     for column, layout in zip(grid.T, LAYOUTS, strict=True):
         for axes, unit in zip(column, ("steps", "minutes"), strict=True):
             axes.set(title=layout, xlabel=unit, ylim=(-3, 103))
-            axes.spines[["top", "right"]].set_visible(False)
-            axes.grid(axis="y", color="#e7eaef")
+            style_axes(axes, "y")
             for (preset, shape), style in CURVES.items():
                 path = RUNS / f"{preset}-NaoTouch{shape}{layout}-v1.csv"
                 rows = list(csv.DictReader(path.open())) if path.exists() else []
@@ -264,8 +222,9 @@ def main() -> None:
     pictures = {
         name: partial(save, make)
         for name, make in (
-            *(("nao", hero), ("tasks", scenes)),
-            *(("instruct", instruct), ("curves", curves)),
+            ("tasks", scenes),
+            ("instruct", instruct),
+            ("curves", curves),
         )
     }
     films = {task: partial(film, task) for task in FILMS}

@@ -25,7 +25,6 @@ from ir_maniskill.evaluation.evaluate import (
     player_of,
 )
 from ir_maniskill.experiment import Experiment
-from ir_maniskill.files import require_writable
 from ir_maniskill.policy import Policy, load_policy
 
 PolicyLike = Policy | str | Path
@@ -101,12 +100,14 @@ def audit(
     from what a vector env observes to actions [N, J] in [-1, 1], or have such a method
     `act` and, if it remembers anything, `reset(done)`. What it has as `env_kwargs` goes
     to `make_vec`; without, it sees pictures and its actions change the joints' targets.
-    `episodes` are those of each row, and `num_envs` at least 2.
+    `episodes` are those of each row, `num_envs` at least 2, and all splits are played.
 
     Returns:
         The table: `print` shows it, `evaluation.plots.bars` draws it.
     """
     require_whole("num_envs", num_envs, 2)
+    split = env_kwargs.get("split")
+    require(split is None, "split", split, "none: an audit plays all there are")
     if isinstance(policy, Policy | str | Path):
         robot = env_kwargs.get("robot_uids")
         policy, experiment, _ = _prepare(
@@ -162,16 +163,14 @@ def record(
     the sentences take turns, and `speed` is 0.05 to 4, of which 1 is real time.
 
     Raises:
-        OSError: The film cannot be written.
+        OSError: The film cannot be written; this is found before anything is played.
     """
     path = Path(path)
-    video.check_name(path)
     plays = isinstance(speed, float | int) and 0.05 <= speed <= 4
     require(plays, "speed", speed, "0.05 to 4")
     policy, experiment, chosen = _prepare(
         policy, task, any_task, episodes, seed, instruction
     )
-    require_writable(path)
     steps = video.record(
         policy.agent.policy,
         experiment.id,

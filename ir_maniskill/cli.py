@@ -21,7 +21,7 @@ from tyro.conf import Positional, arg, subcommand
 
 from ir_maniskill import api, bench, doctor
 from ir_maniskill import experiment as catalog
-from ir_maniskill.checks import ConfigError
+from ir_maniskill.checks import ConfigError, require
 from ir_maniskill.environment.robots.robot import Robot, available_robots, short_name
 from ir_maniskill.evaluation import plots, video
 from ir_maniskill.evaluation.evaluate import EVALUATION_SEED, write_report
@@ -182,13 +182,17 @@ class Audit(_Play):
     json: Path | None = None
     """File to write the table to."""
     picture: Path | None = None
-    """File to draw it to (.png)."""
+    """File to draw it to (.png, .pdf, .svg)."""
 
     def run(self) -> None:
         """Print the table, write and draw it."""
-        for path in (self.json, self.picture):
-            if path is not None:
-                require_writable(path)
+        if self.json is not None:
+            require_writable(self.json)
+        if self.picture is not None:
+            require_writable(self.picture, plots.ENDINGS)
+        both = f"{self.policy} and {self.checkpoint}"
+        alone = self.policy is None or self.checkpoint is None
+        require(alone, "--policy and --checkpoint", both, "one of them")
         policy = _function(self.policy) if self.policy else self.policy_file()
         options = self.options("episodes", "num_envs")
         report = api.audit(policy, catalog.get(self.env_id).id, **options)
@@ -268,8 +272,7 @@ class Talk:
                 "pip install 'ir-maniskill[talk]'"
             ) from None
         if self.record is not None:
-            video.check_name(self.record)
-            require_writable(self.record)
+            require_writable(self.record, video.ENDINGS)
         live.run(
             Session(
                 catalog.get(self.env_id).id,
@@ -286,7 +289,7 @@ class Talk:
 
 @dataclasses.dataclass(frozen=True)
 class Curve:
-    """Draw the learning curve of a run (.png)."""
+    """Draw the learning curve of a run (.png, .pdf, .svg)."""
 
     folder: Positional[Annotated[Path, arg(metavar="FOLDER")]]
     """Folder of the run."""

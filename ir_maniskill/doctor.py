@@ -43,6 +43,11 @@ BACKPORTS = (
 )
 """Where Debian 12 has a Mesa that is new enough."""
 
+PACKAGES_ADVICE = (
+    "Python packages are missing here. Install them first: `make setup`, or "
+    "`pip install -e .` in an environment of your own."
+)
+
 NVIDIA_ADVICE = (
     "An NVIDIA driver is here, but not its Vulkan part. Install the driver's graphics "
     "libraries (libnvidia-gl-...); in a container set NVIDIA_DRIVER_CAPABILITIES=all. "
@@ -131,6 +136,8 @@ def diagnose() -> Diagnosis:
     }
     device = None if error else _device_name(probe.get("summary", ""))
     remedy, advice = ((), None) if error is None else prescribe(release)
+    if None in facts.values():
+        remedy, advice = (), PACKAGES_ADVICE
     return Diagnosis(facts, device, error, remedy, advice)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,19 +15,20 @@ def replacing(path: Path) -> Iterator[Path]:
     """Yield a new file's path beside `path`; at the end it takes the place of `path`.
 
     Args:
-        path: The file to write. Its folder is made if need be.
+        path: The file to write, maybe through a link. Its folder is made if need be.
 
     Raises:
         OSError: It cannot be written; the file there before is untouched.
     """
-    aside = path.with_name(f".{os.getpid()}.{path.name}")
+    target = path.resolve()
+    aside = target.with_name(f".{os.getpid()}.{target.name}")
     try:
         with writing(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
+            target.parent.mkdir(parents=True, exist_ok=True)
             yield aside
             with aside.open("rb") as file:
                 os.fsync(file.fileno())
-            aside.replace(path)
+            aside.replace(target)
     finally:
         aside.unlink(missing_ok=True)
 
@@ -38,20 +39,31 @@ def write_json(path: Path, data: Any) -> None:
         aside.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
 
 
-def require_writable(path: Path) -> None:
-    """Raise OSError before the work is done whose result could not be written."""
-    new = not path.exists()
+def require_writable(path: Path, endings: Sequence[str] = ()) -> None:
+    """Refuse a path before the work is done whose result could not be written there.
+
+    Raises:
+        ValueError: The name has none of the endings, such as ".png".
+        OSError: It cannot be written.
+    """
+    if endings and path.suffix.lower() not in endings:
+        expected = f"a name ending in {' or '.join(endings)}"
+        raise ValueError(f"file: got {path}, expected {expected}")
+    target = path.resolve()
+    new = not target.exists()
     with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.open("ab").close()
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.open("ab").close()
         if new:
-            path.unlink()
+            target.unlink()
 
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
     """Turn whatever keeps `path` from being written into one clear OSError."""
     try:
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise OSError("it is no file")  # as root one would replace /dev/null
         yield
     except OSError as error:
         reason = error.strerror or error

@@ -9,41 +9,27 @@ from pathlib import Path
 import gymnasium as gym
 
 
-def main() -> None:
-    """Run all checks against the environment whose folder is the first argument."""
-    prefix = Path(sys.argv[1]).resolve()
+def main(prefix: Path) -> None:
+    """Check that all comes from this folder, nothing from a checkout, and step."""
     assert "ir_maniskill" not in sys.modules
     env = gym.make(
         "ir_maniskill:NaoTouchCubeSingle-v1",
         obs_mode="rgb",
         sensor_configs={"width": 64, "height": 128},
     )
-    check_origin(prefix)
-    check_step(env)
-    env.close()
-    print(f"The installed wheel works: {prefix}")
+    for name, module in sorted(sys.modules.items()):
+        if name.partition(".")[0] == "ir_maniskill" and module.__file__:
+            assert Path(module.__file__).resolve().is_relative_to(prefix), module
+    assert "ir_maniskill.tasks" in sys.modules, "the tasks were not imported"
+    urdf = Path(str(resources.files("ir_maniskill.assets") / "nao" / "nao.urdf"))
+    assert urdf.is_file() and urdf.resolve().is_relative_to(prefix), urdf
+    assert any(urdf.parent.rglob("*.glb")), f"no meshes beside {urdf}"
 
-
-def check_origin(prefix: Path) -> None:
-    """Check that modules and data files lie under the prefix, none in a checkout."""
     from ir_maniskill.language.lexicon import lexicon
 
-    for name, module in sorted(sys.modules.items()):
-        if name.partition(".")[0] != "ir_maniskill" or not module.__file__:
-            continue
-        assert Path(module.__file__).resolve().is_relative_to(prefix), module
-    assert "ir_maniskill.tasks" in sys.modules, "the tasks were not imported"
-    nao = resources.files("ir_maniskill.assets") / "nao"
-    urdf = Path(str(nao / "nao.urdf"))
-    assert urdf.is_file() and urdf.resolve().is_relative_to(prefix), urdf
-    meshes = [path for path in urdf.parent.rglob("*.glb")]
-    assert meshes, f"no meshes beside {urdf}"
     shares = lexicon(("<pad>", "<unk>", "red", "blue")).read("crimson")
     assert next(iter(shares), None) == "red", shares
 
-
-def check_step(env: gym.Env) -> None:
-    """Check that a reset and a step give images, an instruction and a reward."""
     observation, _ = env.reset(seed=0)
     for camera in ("top_camera", "front_camera"):
         picture = observation["sensor_data"][camera]["rgb"]
@@ -52,7 +38,9 @@ def check_step(env: gym.Env) -> None:
     _, reward, *_, info = env.step(env.action_space.sample())
     assert reward.shape == (1,) and "success" in info
     assert "Touch the" in env.unwrapped.get_language_instruction()[0]
+    env.close()
+    print(f"The installed wheel works: {prefix}")
 
 
 if __name__ == "__main__":
-    main()
+    main(Path(sys.argv[1]).resolve())

@@ -1,6 +1,5 @@
 """Debian's Chromium without a window, driven by its own DevTools protocol."""
 
-import base64
 import itertools
 import json
 import shutil
@@ -24,6 +23,7 @@ FLAGS = (
     "--disable-component-update",
     "--disable-sync",
     "--hide-scrollbars",
+    "--window-size=1280,800",
     "--remote-debugging-port=0",
 )
 
@@ -31,12 +31,11 @@ FLAGS = (
 class Browser:
     """One tab; `seen` are the addresses that it asked for."""
 
-    def __init__(self, address, width=1280, height=800):
+    def __init__(self, address):
         self.folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
         folder = f"--user-data-dir={self.folder.name}"
-        size = f"--window-size={width},{height}"
         self.process = subprocess.Popen(
-            [CHROMIUM, *FLAGS, folder, size, "about:blank"],
+            [CHROMIUM, *FLAGS, folder, "about:blank"],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
@@ -68,10 +67,6 @@ class Browser:
 
     def text(self):
         return self.evaluate("document.body.innerText") or ""
-
-    def screenshot(self, path):
-        data = self.call("Page.captureScreenshot", format="png")["data"]
-        Path(path).write_bytes(base64.b64decode(data))
 
     def mouse(self, kind, x, y, buttons=1):
         self.call(

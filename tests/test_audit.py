@@ -1,6 +1,7 @@
 """An audit takes away what it says, nothing else, and counts what happens."""
 
 import contextlib
+import dataclasses
 from types import SimpleNamespace
 from typing import ClassVar
 
@@ -15,6 +16,7 @@ from ir_maniskill.evaluation import audit as audits
 from ir_maniskill.evaluation import plots
 from ir_maniskill.evaluation.audit import AuditReport, Row, at_random, blind, controls
 from ir_maniskill.evaluation.evaluate import Rate
+from ir_maniskill.evaluation.scripted import NotScriptedError
 from ir_maniskill.language.tokens import UNK
 from ir_maniskill.training.checkpoint import MismatchError
 
@@ -86,6 +88,17 @@ def test_another_sentence_is_never_the_true_one(told, instead):
     assert read_text(after["text"])[0] == TASK.sentences[instead]
 
 
+def test_another_sentence_has_another_goal():
+    blue, red, _ = TASK.instructions
+    same = dataclasses.replace(blue, text="Touch blue.")
+    task = dataclasses.replace(TASK, id="Same-v1", instructions=(blue, same, red))
+    tokens = tokens_of(task.sentences, task.vocabulary, task.max_tokens)
+    change = controls(task, space_of(observation()))["another sentence"]
+    for told, instead in enumerate((2, 2, 0)):
+        after = change({"extra": {"instruction": tokens[[told]]}})["extra"]
+        assert torch.equal(after["instruction"], tokens[[instead]])
+
+
 def test_other_pictures_are_those_of_the_next_env():
     pictures = changed("pictures of another env", observation())["sensor_data"]
     assert pictures["top_camera"]["rgb"][:, 0, 0, 0].tolist() == [9, 7]
@@ -133,14 +146,19 @@ def test_each_row_plays_the_same_episodes(monkeypatch, multi_vec, caplog):
 
 
 def test_what_is_not_scripted_has_no_row(monkeypatch, multi_vec, caplog):
-    def refuse(_):
-        raise ValueError("goal: got Spin")
+    def fail(error):
+        raise error
 
-    none = SimpleNamespace(base_env=None, close=lambda: None)
-    monkeypatch.setattr(audits, "blind", lambda *_: none)
-    monkeypatch.setattr(audits, "Scripted", refuse)
+    alone = SimpleNamespace(
+        base_env=NotScriptedError("goal: got Spin"), close=lambda: None
+    )
+    monkeypatch.setattr(audits, "blind", lambda *_: alone)
+    monkeypatch.setattr(audits, "Scripted", fail)
     assert audits._scripted(multi_vec, [], []) == []
     assert "no scripted solution: goal: got Spin" in caplog.text
+    alone.base_env = ValueError("a fault of ours")
+    with pytest.raises(ValueError, match="a fault of ours"):
+        audits._scripted(multi_vec, [], [])
 
 
 def test_a_report_is_a_table_data_and_a_picture(tmp_path):
@@ -187,9 +205,11 @@ def test_anybodys_function_is_audited_on_what_envs_observe(monkeypatch):
         ir_maniskill.audit(audits, TASK.id)
 
 
-def test_a_policy_is_not_audited_on_another_robot():
+def test_a_policy_is_not_audited_on_another_robot_or_one_split():
     with pytest.raises(MismatchError, match="robot: got 'nao', expected 'g1'"):
         ir_maniskill.audit(TASK.id, robot_uids="g1")
+    with pytest.raises(ValueError, match="split: got 'pairs', expected none"):
+        ir_maniskill.audit(TASK.id, split="pairs")
 
 
 def test_several_sentences_are_true_of_one_spoken_scene():

@@ -40,16 +40,12 @@ def demonstrate(folder: Path) -> list[Any]:
     return [cli.parse(line.split()) for line in lines]
 
 
-def test_an_interrupted_training_goes_on(folder: Path) -> None:
-    (folder / "best.safetensors").touch()
-    training, *_ = demonstrate(folder)
-    assert training.resume and training.config.out == str(folder)
-
-
 def test_the_demonstration_trains_from_pictures_and_leaves_figures_and_a_film(
     folder: Path,
 ) -> None:
+    (folder / "best.safetensors").touch()  # of a training that was interrupted
     training, *rest = demonstrate(folder)
+    assert training.resume and training.config.out == str(folder)
     evaluation, video, curve = rest
     assert demonstrate(folder) == rest  # a finished training is not made again
     assert training.config.agent.senses == ("vision",)

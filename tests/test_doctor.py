@@ -80,6 +80,13 @@ def test_newer_systems_need_no_other_suite(release):
     assert "mesa-vulkan-drivers libvulkan1" in commands[1]
 
 
+def test_missing_packages_come_before_drivers(broken, monkeypatch):
+    monkeypatch.setattr(doctor, "_version", lambda name: None)
+    diagnosis = doctor.diagnose()
+    assert not diagnosis.healthy and diagnosis.remedy == ()
+    assert "pip install -e ." in str(diagnosis) and "apt-get" not in str(diagnosis)
+
+
 @pytest.mark.parametrize("release", ["ubuntu 22.04", "debian ", "fedora 41", " "])
 def test_unknown_systems_get_advice_and_no_commands(release):
     system, version = release.split(" ")

@@ -3,15 +3,13 @@
 import json
 import os
 import re
-import runpy
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from ir_maniskill import available, load_policy
-from ir_maniskill.training.config import CONFIGS
+from ir_maniskill import load_policy
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 TINY = """
@@ -49,22 +47,6 @@ def script(name: str) -> str:
     return str(EXAMPLES / name)
 
 
-def test_train_knows_the_three_experiments_of_the_paper() -> None:
-    example = runpy.run_path(script("train.py"))
-    assert set(example["TASKS"].values()) <= set(available())
-    assert set(example["STEPS"]) == set(CONFIGS) - {"listen"}  # of many sentences
-    for steps in example["STEPS"].values():
-        assert set(steps) == set(example["TASKS"])
-
-
-@pytest.mark.render
-@pytest.mark.slow
-def test_random_actions_leave_a_film(tmp_path: Path) -> None:
-    out = run(tmp_path, script("random_actions.py"), "--episodes", "1")
-    assert re.match(r"Touch the (blue|red|green) cube\. +(not )?touched", out)
-    assert len(list(tmp_path.glob("runs/random_actions/*.mp4"))) == 1
-
-
 @pytest.mark.render
 @pytest.mark.slow
 def test_vector_envs_finish_two_episodes_each(tmp_path: Path) -> None:
@@ -100,19 +82,6 @@ def test_stable_baselines3_trains(tmp_path: Path) -> None:
     assert re.search(r"total_timesteps +\| 256 ", out)
     assert re.search(r"\d of 1 episodes touched", out)
     assert (tmp_path / "runs" / "sb3_ppo.zip").stat().st_size > 1000
-
-
-@pytest.mark.render
-@pytest.mark.slow
-def test_training_then_evaluating_its_policy(tmp_path: Path) -> None:
-    out = run(tmp_path, "-c", TINY, script("train.py"), "single", "--steps", "64")
-    policy = tmp_path / "runs" / "single" / "best.safetensors"
-    assert str(policy.relative_to(tmp_path)) in out and policy.is_file()
-    arguments = ("--checkpoint", str(policy), "--episodes", "1")
-    out = run(tmp_path, "-c", TINY, script("evaluate_and_record.py"), *arguments)
-    assert re.search(r"Touch the blue cube\. +1 ", out)
-    for name in ("report.json", "video.mp4"):
-        assert (tmp_path / "runs" / "evaluation" / name).stat().st_size > 1000
 
 
 @pytest.mark.render

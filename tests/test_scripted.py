@@ -17,7 +17,13 @@ from ir_maniskill import (
 )
 from ir_maniskill.evaluation.audit import blind
 from ir_maniskill.evaluation.evaluate import play
-from ir_maniskill.evaluation.scripted import Aim, Scripted, acts_in, clearance
+from ir_maniskill.evaluation.scripted import (
+    Aim,
+    NotScriptedError,
+    Scripted,
+    acts_in,
+    clearance,
+)
 from ir_maniskill.goals import Avoid, Both, Then, Touch
 
 RED, BLUE = Ref("red"), Ref("blue")
@@ -87,8 +93,14 @@ def test_least_squares_bring_the_tip_where_it_shall_be(scripted):
 
 def test_what_is_to_be_left_alone_is_nothing_to_do():
     assert acts_in(GOALS["Touch red, not blue."]) == [Touch(RED)]
-    with pytest.raises(ValueError, match="expected Touch, Push, Avoid"):
+    with pytest.raises(NotScriptedError, match="expected Touch, Push, Avoid"):
         acts_in(object.__new__(type("Spin", (Push.__mro__[1],), {"measure": None})))
+
+
+def test_two_things_for_one_hand_are_refused(envs, scripted):
+    goal = Both(Touch(RED, "left"), Touch(BLUE, "left"))
+    with pytest.raises(NotScriptedError, match="expected a hand for each"):
+        play(scripted, envs, [Instruction("Touch both.", goal)], [0])
 
 
 @pytest.mark.parametrize("text", GOALS)

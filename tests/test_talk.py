@@ -223,18 +223,12 @@ def test_what_is_not_there_is_refused_and_all_stays(session, wanted):
 
 
 @pytest.mark.render
-def test_without_a_policy_it_wanders(session):
-    session.choose(policy=RANDOM)
+def test_where_no_policy_fits_chance_moves_the_robot(session):
+    session.choose(robot="panda")
     start = session.poses()
     go_on(session, 10)
     assert session.choice.policy == RANDOM and session.reading.unknown == ()
     assert np.abs(session.poses() - start).max() > 0.01
-
-
-@pytest.mark.render
-def test_where_no_policy_fits_chance_moves_the_robot(session):
-    session.choose(robot="panda")
-    assert session.choice.policy == RANDOM
     session.tell("Touch the red cube with your right hand.")
     session.step()
     assert session.reading.goal is None and "right" in session.reading.meaning
@@ -387,6 +381,13 @@ def test_the_page_listens_here_alone_and_shares_nothing(page):
         assert b"root:" not in line.recv(65536)
 
 
+def test_where_nobody_can_listen_there_is_no_page():
+    with pytest.raises(ValueError, match="port: got 65536, expected a whole number"):
+        Page(None, "127.0.0.1", 65536)
+    with pytest.raises(ValueError, match="host: got '192.0.2.1', expected an address"):
+        Page(None, "192.0.2.1", 8080)
+
+
 @pytest.mark.render
 def test_bodies_are_drawn_on_their_way(page, session):
     go_on(session, 2)
@@ -461,9 +462,9 @@ def pixel(page, point):
 @pytest.mark.render
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium")
-def test_in_a_browser_it_does_as_told(session, tmp_path):
+def test_in_a_browser_it_does_as_told(session):
     with closing(Page(session, "127.0.0.1", 8770)) as page:
-        visit = Thread(target=lambda: found.append(visited(page, tmp_path)))
+        visit = Thread(target=lambda: found.append(visited(page)))
         found: list[dict] = []
         visit.start()
         while visit.is_alive():
@@ -479,7 +480,7 @@ def test_in_a_browser_it_does_as_told(session, tmp_path):
     )
 
 
-def visited(page, folder):
+def visited(page):
     """Visit the page as a person would, and return what was seen there."""
     session, seen = page.session, {}
     start = session.poses()  # nothing moves before somebody looks
@@ -499,7 +500,6 @@ def visited(page, folder):
         seen["lights"] = lit(session)
         seen["moved"] = np.abs(session.poses() - start)[:, :3].max()
         wait_for(lambda: "success" in browser.text())
-        browser.screenshot(folder / "told.png")
         place = session.scene.position[0, 2].numpy()
         x, y = pixel(page, place)
         drag(browser, x, y)
@@ -509,7 +509,6 @@ def visited(page, folder):
         say("dance <i>twice</i>")
         wait_for(lambda: "not understood" in browser.text())
         seen["nonsense"] = browser.text()
-        browser.screenshot(folder / "nonsense.png")
         seen["asked"] = browser.seen
         drag(browser, *pixel(page, session.scene.position[0, 2].numpy()))
         wait_for(lambda: session.held is not None)

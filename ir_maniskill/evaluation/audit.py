@@ -41,7 +41,7 @@ from ir_maniskill.evaluation.evaluate import (
     play,
     score_by_name,
 )
-from ir_maniskill.evaluation.scripted import Scripted
+from ir_maniskill.evaluation.scripted import NotScriptedError, Scripted
 from ir_maniskill.experiment import Experiment, Spoken
 from ir_maniskill.goals import Goal, Instruction
 from ir_maniskill.language import SPLITS, draw, things
@@ -197,7 +197,7 @@ def _scripted(
         gc.freeze()  # ManiSkill collects garbage whenever it rebuilds a scene
         try:
             figures, _ = play(Scripted(alone.base_env), alone, told, seeds)
-        except ValueError as error:
+        except NotScriptedError as error:
             log.warning("no scripted solution: %s", error)
             return []
         finally:
@@ -247,7 +247,8 @@ def controls(task: Experiment, space: Any) -> dict[str, Change]:
         found["no joints"] = _with("agent", torch.zeros_like)
     if "instruction" in extra:
         found["no sentence"] = _with("extra", _padding, "instruction", "text")
-        if len(task.sentences) != 1:
+        own = task.instructions
+        if isinstance(own, Spoken) or len({i.goal for i in own}) > 1:
             found["another sentence"] = _another_sentence(task)
         found["words spelt backwards"] = _backwards(task.vocabulary)
     return found
@@ -280,22 +281,30 @@ def _padding(leaf: Tensor) -> Tensor:
 
 
 def _another_sentence(task: Experiment) -> Change:
-    """Return what tells the task's next sentence, or that of another env."""
-    if not task.sentences:
+    """Return what tells the task's next sentence of another goal, or another env's."""
+    if isinstance(task.instructions, Spoken):
         return _with("extra", _of_another, "instruction", "text")
     tokens = tokens_of(task.sentences, task.vocabulary, task.max_tokens)
     text = text_of(task.sentences, TEXT_BYTES)
+    goals = [own.goal for own in task.instructions]
+    others = torch.tensor([_next_other(goals, i) for i in range(len(goals))])
 
     def changed(obs: Observation) -> Observation:
         extra, table = obs["extra"], tokens.to(obs["extra"]["instruction"])
         said = (extra["instruction"][:, None] == table).all(dim=2).int().argmax(dim=1)
-        other = (said + 1) % len(table)
+        other = others.to(said)[said]
         new = {"instruction": table[other]}
         if "text" in extra:
             new["text"] = text.to(extra["text"])[other]
         return {**obs, "extra": {**extra, **new}}
 
     return changed
+
+
+def _next_other(goals: Sequence[Goal], place: int) -> int:
+    """Return the place of the next goal, round and round, that is another one."""
+    turn = (*range(place, len(goals)), *range(place))
+    return next(i for i in turn if goals[i] != goals[place])
 
 
 def _backwards(vocabulary: tuple[str, ...]) -> Change:

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from ir_maniskill.checks import ConfigError
 from ir_maniskill.evaluation.audit import AuditReport
-from ir_maniskill.files import replacing
+from ir_maniskill.files import replacing, require_writable
 from ir_maniskill.training.run_folder import whole_rows
 
 Row = Mapping[str, float]
@@ -24,6 +24,8 @@ SHARES = (
     ("holding", "steps in which it holds", "#9aa3b2"),
 )
 """What metrics.csv and evaluations.csv have shares of, its name and its color."""
+ENDINGS = (".png", ".pdf", ".svg")
+"""Of the names of pictures."""
 INK = "#24292f"
 """Axes and text."""
 
@@ -39,7 +41,7 @@ def learning_curve(run: Path, out: Path | None = None) -> Path:
         out: Picture to write; None: learning_curve.png in the folder.
 
     Raises:
-        ConfigError: The folder holds no metrics.
+        ValueError: The folder holds no metrics, or `out` is no name of a picture.
     """
     metrics = _read(run / "metrics.csv")
     if not metrics:
@@ -69,7 +71,7 @@ def learning_curve(run: Path, out: Path | None = None) -> Path:
     returns.plot(*_points(metrics, "train/return"), color=SHARES[0][2], linewidth=1.8)
     returns.set(ylabel="Return of an episode", xlabel="Environment steps")
     for axes in (shares, returns):
-        _style(axes, "y")
+        style_axes(axes, "y")
         axes.spines[["left", "bottom"]].set_color("#c9ced6")
         axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g} k")
     return _save(figure, out or run / "learning_curve.png")
@@ -103,7 +105,7 @@ def bars(report: AuditReport, out: Path) -> Path:
             axes.errorbar(100 * share, at, xerr=error, fmt="none", ecolor=INK, lw=0.9)
     axes.set_yticks(at, [row.name for row in rows], fontsize=8, color=INK)
     axes.set(xlim=(0, 101), xlabel="Episodes, 95% interval of exclusive success [%]")
-    _style(axes, "x")
+    style_axes(axes, "x")
     axes.spines["left"].set_visible(False)
     figure.suptitle(f"{report.env_id}, {report.episodes} episodes a row", color=INK)
     figure.legend(
@@ -132,7 +134,7 @@ def _points(
     return [row["steps"] for row in rows], [scale * row[column] for row in rows]
 
 
-def _style(axes: Axes, grid: Literal["x", "y"]) -> None:
+def style_axes(axes: Axes, grid: Literal["x", "y"]) -> None:
     """Leave of the axes what is needed, with a grid along one of them."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(colors=INK, length=0)
@@ -141,6 +143,7 @@ def _style(axes: Axes, grid: Literal["x", "y"]) -> None:
 
 
 def _save(figure: Figure, path: Path) -> Path:
+    require_writable(path, ENDINGS)
     with replacing(path) as aside:
         figure.savefig(aside)
     return path

@@ -74,6 +74,10 @@ FAST, AHEAD = 0.35, 0.6
 """Largest change of the numbers in a step, and lead over where they are [rad]."""
 
 
+class NotScriptedError(ValueError):
+    """A robot or a goal that the scripted solution cannot play."""
+
+
 class Hand(NamedTuple):
     """Where a hand is."""
 
@@ -105,7 +109,11 @@ class Arm:
     """An arm and its hand: where it is by its numbers, and the numbers for an aim."""
 
     def __init__(self, robot: Robot, hand: str) -> None:
-        """Read a hand's kinematics, and try random postures to start searches from."""
+        """Read a hand's kinematics, and try random postures to start searches from.
+
+        Raises:
+            NotScriptedError: The fingers have no joints.
+        """
         self.scale, fingers = robot.scale, robot.hands[hand]
         articulation = robot.robot
         self._model = articulation._objs[0].create_pinocchio_model()
@@ -118,7 +126,7 @@ class Arm:
         moved = [articulation.joints_map[j].child_link.name for j in robot.joints]
         distal = set(itertools.chain(*chains)) - set(upper)
         if not distal.intersection(moved):
-            raise ValueError(
+            raise NotScriptedError(
                 f"hand {hand!r} of {robot.uid!r}: got stiff fingers, expected joints"
             )
         self.joints = np.array([i for i, name in enumerate(moved) if name in upper])
@@ -328,14 +336,14 @@ def acts_in(goal: Goal) -> list[Touch | Push]:
     """Return what is to be done at the same time.
 
     Raises:
-        ValueError: There is a verb that is not scripted.
+        NotScriptedError: There is a verb that is not scripted.
     """
     if isinstance(goal, Touch | Push):
         return [goal]
     if isinstance(goal, Avoid):
         return []
     if not goal.parts:
-        raise ValueError(
+        raise NotScriptedError(
             f"goal: got {goal}, expected Touch, Push, Avoid, Both or Then of these"
         )
     return [act for part in goal.parts for act in acts_in(part)]
@@ -455,7 +463,11 @@ class Scripted:
     # -- Which hand does what ----------------------------------------------------------
 
     def _assign(self, view: View, goal: Goal) -> dict[str, Act]:
-        """Return which hand does what: those that reach it best."""
+        """Return which hand does what: those that reach it best.
+
+        Raises:
+            NotScriptedError: There is more to do than there are hands.
+        """
         for _ in range(view.stage):
             goal = goal.b if isinstance(goal, Then) else goal
         goals = acts_in(goal.a if isinstance(goal, Then) else goal)
@@ -470,6 +482,10 @@ class Scripted:
             for way in itertools.permutations(self.arms, len(goals))
             if rated.keys() >= set(enumerate(way))
         ]
+        if not ways:
+            raise NotScriptedError(
+                f"goal: got {goals}, expected a hand for each, of {[*self.arms]}"
+            )
         return min(ways, key=lambda way: sum(act.miss for act in way.values()))
 
     def _rate(self, view: View, goal: Touch | Push, hand: str) -> Act:

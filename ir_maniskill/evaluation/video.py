@@ -8,12 +8,13 @@ in their place, a light for every finger, and the counters.
 from __future__ import annotations
 
 import errno
+import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import cache
-from itertools import takewhile
+from itertools import islice, pairwise, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ from ir_maniskill.environment.senses import StateStack, cameras, felt
 from ir_maniskill.environment.table_scene import view
 from ir_maniskill.environment.touch_env import CONTROL_FREQ
 from ir_maniskill.evaluation.evaluate import Policy, choose_instructions, threads
-from ir_maniskill.files import replacing
+from ir_maniskill.files import replacing, require_writable
 
 Box = tuple[int, int, int, int]
 """Left, top, width and height [pixel]."""
@@ -39,6 +40,8 @@ Color = tuple[int, int, int]
 Scene = tuple[dict[str, Any], torch.Tensor]
 """The simulator's state, and which body is in each slot of the table [1, C]."""
 
+ENDINGS = (".mp4", ".gif")
+"""Of the names of films."""
 SIZE = (1280, 720)
 """Width and height of a frame [pixel]."""
 VIEW: Box = (32, 100, 836, 540)
@@ -404,8 +407,9 @@ def write_video(
 
     Raises:
         ValueError: Of another name.
+        OSError: It cannot be written.
     """
-    check_name(path)
+    require_writable(path, ENDINGS)
     rate = CONTROL_FREQ * speed
     count = 0
 
@@ -420,12 +424,6 @@ def write_video(
     with replacing(path) as aside:
         write(aside, frames(), rate)
     return count
-
-
-def check_name(path: Path) -> None:
-    """Raise ValueError unless the name ends in .mp4 or .gif."""
-    if path.suffix.lower() not in (".mp4", ".gif"):
-        raise ValueError(f"video: got {path}, expected a name ending in .mp4 or .gif")
 
 
 def _write_mp4(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
@@ -450,9 +448,15 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
 
 
 def _write_gif(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
-    """Write half the size, with one palette for all frames, to stay small."""
+    """Write half the size, with one palette for all frames, to stay small.
+
+    Browsers show no frame for less than 1/50 s, and times are in 1/100 s.
+    """
     size, smooth = (SIZE[0] // 2, SIZE[1] // 2), Image.Resampling.LANCZOS
-    images = [Image.fromarray(frame).resize(size, smooth) for frame in frames]
+    every = math.ceil(rate / 50)
+    shown = islice(frames, 0, None, every)
+    images = [Image.fromarray(frame).resize(size, smooth) for frame in shown]
+    ends = [round(100 * every * n / rate) for n in range(len(images) + 1)]  # [1/100 s]
     some = [
         np.asarray(image) for image in (images[0], images[len(images) // 2], images[-1])
     ]
@@ -466,7 +470,7 @@ def _write_gif(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
         path,
         save_all=True,
         append_images=images[1:],
-        duration=round(1000 / rate),
+        duration=[10 * (end - start) for start, end in pairwise(ends)],
         loop=0,
         optimize=True,
     )

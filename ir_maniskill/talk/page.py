@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
+import socket
 from collections.abc import Callable
 from functools import partial
 from queue import Empty, SimpleQueue
@@ -15,6 +16,7 @@ import viser
 from PIL import Image
 
 from ir_maniskill import experiment as catalog
+from ir_maniskill.checks import ConfigError, require_whole
 from ir_maniskill.talk import cards
 from ir_maniskill.talk.players import RANDOM
 from ir_maniskill.talk.session import PAPER, Session, robots
@@ -49,7 +51,18 @@ class Page:
     """
 
     def __init__(self, session: Session, host: str, port: int) -> None:
-        """Open the page."""
+        """Open the page.
+
+        Raises:
+            ValueError: It cannot listen at that address.
+        """
+        require_whole("port", port, 0, 65535)
+        try:  # viser would wait for ever
+            family, *_, address = socket.getaddrinfo(host, 0)[0]
+            socket.create_server(address, family=family).close()
+        except OSError as error:
+            expected = f"an address of this machine ({error})"
+            raise ConfigError(f"host: got {host!r}, expected {expected}") from None
         self.session = session
         self.paused, self.speed = False, 1.0
         self._wishes: SimpleQueue[Callable[[], None]] = SimpleQueue()
