@@ -86,6 +86,17 @@ def test_stable_baselines3_trains(tmp_path: Path) -> None:
 
 @pytest.mark.render
 @pytest.mark.slow
+def test_a_policy_is_trained_evaluated_and_filmed(tmp_path: Path) -> None:
+    arguments = ("--steps", "64", "--episodes", "1")
+    out = run(tmp_path, "-c", TINY, script("train.py"), *arguments)
+    assert re.search(r"Touch the blue cube\. +1 ", out)
+    folder = tmp_path / "runs" / "NaoTouchCubeSingle-v1"
+    for name in ("best.safetensors", "film.mp4"):
+        assert (folder / name).stat().st_size > 1000 and name in out
+
+
+@pytest.mark.render
+@pytest.mark.slow
 def test_a_task_is_learned_from_scratch_or_from_another_policy(tmp_path: Path) -> None:
     command = ("-c", TINY, script("pretrained.py"), "--steps", "128")
     run(tmp_path, *command)

@@ -132,12 +132,24 @@ def test_push_measures_the_way_along_and_to_the_side(moved, holds, gap, level):
     at.fingertip[:, 4] = at.position[:, 1] - torch.tensor([0.03, 0.04, 0.02])
     measure, verdict = measured(Push(RED, "left", 0.05), at)
     assert measure.holds.item() == holds
-    # A finger is 3 cm beside the place behind it. There it should be 3 cm higher, and
-    # is 2 cm lower; height counts twice.
-    way = math.hypot(0.03, 0.1)
+    # A finger is 3 cm beside the way and 2 cm too low or high, which counts twice.
+    way = math.hypot(0.03, 0.04)
     assert measure.gap.item() == pytest.approx(0 if holds else gap + way, abs=1e-4)
     assert measure.level.item() == pytest.approx(level)
     assert not verdict.foul
+
+
+@pytest.mark.parametrize(
+    ("ahead", "height"), [(-0.05, 0.0), (0.015, 0.0), (0.025, 0.02), (0.06, 0.05)]
+)
+def test_fingers_pass_over_what_they_push_and_go_down_behind_it(ahead, height):
+    def gap(z):
+        at = scene()
+        at.fingertip[:, 4] = at.position[:, 1] + torch.tensor([0, ahead - 0.04, z])
+        return measured(Push(RED, "left", 0.05), at)[0].gap.item()
+
+    assert gap(height) == pytest.approx(0.05 + abs(ahead), abs=1e-4)
+    assert min(gap(height + 0.01), gap(height - 0.01)) > gap(height)
 
 
 def test_a_push_that_moves_another_object_is_a_foul():
