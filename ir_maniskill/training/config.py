@@ -264,8 +264,8 @@ CONFIGS: dict[str, TrainConfig] = {
     "default": TrainConfig(),
     "listen": TrainConfig(
         algorithm="sac",
-        total_steps=440_000,
-        eval_interval=110_000,
+        total_steps=600_000,
+        eval_interval=100_000,
         frames=1,
         penalty_warmup=0.0,
         reward_weights=RewardWeights(
