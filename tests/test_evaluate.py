@@ -32,7 +32,7 @@ class ScriptedEnvs:
 
     device = torch.device("cpu")
     experiment = SimpleNamespace(
-        id="Scripted-v1", sentences=SENTENCES, instructions=TOLD
+        id="Scripted-v1", sentences=SENTENCES, instructions=TOLD, max_tokens=10
     )
 
     def __init__(self, num_envs):

@@ -93,8 +93,8 @@ def train(
     else:
         require(isinstance(task, TrainConfig), "task", task, "an id or a TrainConfig")
         config = dataclasses.replace(task, **changes)
-        if envs is None:
-            env_id = catalog.get(config.env_id).id
+        if ":" in config.env_id:
+            env_id = catalog.get(config.env_id).id  # without its module
             config = dataclasses.replace(config, env_id=env_id)
         stored = stored_config(Path(config.out)) if resume else None
         if stored is not None:
