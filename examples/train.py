@@ -4,7 +4,7 @@
     python examples/train.py --task NaoTouchCubeTriangle-v1 --steps 250000
     python examples/train.py --preset paper --steps 150000
 
-The first takes some five minutes on two cores. Ctrl-C keeps a checkpoint, from which
+The first takes a few minutes on two cores. Ctrl-C keeps a checkpoint, from which
 --resume goes on. `ir-maniskill train --help-all` lists every number there is.
 """
 

@@ -103,6 +103,7 @@ def test_without_a_policy_the_error_tells_how_to_train(monkeypatch, tmp_path, ca
         (["train", IDS[0], "--num-envs", "0"], "num_envs: got 0"),
         (["train", IDS[0], "--preset", "fast"], "default, listen, vision, paper"),
         (["curve", "/nowhere"], "/nowhere"),
+        (["audit", IDS[0], "--checkpoint", "/nowhere/best"], "/nowhere/best"),
         (["video", IDS[0], "--out", "/dev/null/film.mp4"], "cannot write /dev/null/f"),
         (["evaluate", IDS[0], "--json", "/dev"], "cannot write /dev: Is a directory"),
         (["bench", "--json", "/dev/null/x"], "cannot write /dev/null/x: "),

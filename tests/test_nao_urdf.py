@@ -18,7 +18,7 @@ import ir_maniskill
 from ir_maniskill import Jitter
 from ir_maniskill import experiment as catalog
 from ir_maniskill.assets.nao import URDF_PATH, facts
-from ir_maniskill.environment.robots.nao import JOINTS, Nao
+from ir_maniskill.environment.robots.nao import JOINTS
 from ir_maniskill.environment.robots.nao_urdf import adapt
 from ir_maniskill.environment.robots.robot import RobotError
 
@@ -233,7 +233,7 @@ def test_a_missing_file_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def env(urdf: Path) -> Iterator[gym.Env]:
+def env(urdf: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[gym.Env]:
     """The triangle without jitter, with the user's NAO."""
     still = dataclasses.replace(
         catalog.get("NaoTouchCubeTriangle-v1"),
@@ -241,17 +241,9 @@ def env(urdf: Path) -> Iterator[gym.Env]:
         jitter=Jitter(0, 0, 0),
     )
     ir_maniskill.register(still)
-
-    class Users(Nao):
-        uid = "users"
-        urdf_path = str(urdf)
-
-    env = gym.make(
-        "UsersTriangle-v1",
-        robot_uids=Users,
-        obs_mode="rgb+state_dict",
-        sensor_configs={"width": 32, "height": 64, "shader_pack": "trivial"},
-    )
+    monkeypatch.setenv(VARIABLE, str(urdf))
+    small = {"width": 32, "height": 64, "shader_pack": "trivial"}
+    env = gym.make("UsersTriangle-v1", obs_mode="rgb+state_dict", sensor_configs=small)
     yield env
     env.close()
 

@@ -320,6 +320,11 @@ def test_a_joint_that_is_not_driven_is_held_and_one_that_mimics_is_free(
         (joint("lift", "arm", "tip"), "joint 'lift': got two"),
         (link("flag", BOX.replace("0.02 0.02 0.1", "0")), "link 'flag': <box> size"),
         (link("flag", BOX.replace("box size", "cone size")), "'flag': <geom.*got cone"),
+        (link("flag", "<collision><geometry/></collision>"), "'flag': <geom.*nothing"),
+        (
+            link("flag", BOX.replace("box size='0.02 0.02 0.1'", "sphere radius='0'")),
+            "'flag': <sphere> radius",
+        ),
         (link("flag", MESH), "link 'flag': <mesh> scale.*mirror"),
         (link("flag", MESH.replace("1 -1 1", "1")), "got '1', expected three numbers"),
         (link("flag", MESH.replace("1 -1", "1 1").replace("'x'", "''")), "'filename'"),
