@@ -48,10 +48,9 @@ TASK = Experiment(
 ir_maniskill.register(TASK)
 
 
-def main(train_steps: int = 0) -> None:
-    if train_steps:
-        ir_maniskill.train(TASK.id, total_steps=train_steps, out="runs/spin")
-        print(ir_maniskill.evaluate("runs/spin/best.safetensors", TASK.id, episodes=40))
+def main(train_steps: int = 20_000) -> None:
+    ir_maniskill.train(TASK.id, total_steps=train_steps, out="runs/spin")
+    print(ir_maniskill.evaluate("runs/spin/best.safetensors", TASK.id, episodes=40))
 
 
 if __name__ == "__main__":

@@ -197,6 +197,8 @@ def _prepare(
     """Check what both ask for; return the policy, the task and what to say."""
     require_whole("episodes", episodes, 1)
     require_whole("seed", seed, 0, SEEDS[-1] - 2 * episodes)  # the last ones'
+    expected = "a Policy, a task's id or a file; `audit` takes any function"
+    require(isinstance(policy, Policy | str | Path), "policy", policy, expected)
     if not isinstance(policy, Policy):
         policy = load_policy(policy)
     experiment = catalog.get(task or policy.env_id)

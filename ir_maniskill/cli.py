@@ -108,7 +108,8 @@ class _Play:
     env_id: TaskId
     """Task, e.g. NaoTouchCubeSingle-v1; MODULE is imported first."""
     checkpoint: Path | None = None
-    """Policy or checkpoint file; None: the one that ships with the package."""
+    """Policy or checkpoint file, or the id of a task whose policy ships; None: this
+    task's."""
     any_task: bool = False
     """Accept a policy that was trained for another task."""
     seed: int = EVALUATION_SEED
@@ -122,7 +123,8 @@ class _Play:
             raise ConfigError(
                 f"no policy for {task}: none was given and none ships with the package "
                 f"(looked for {path}). Train one: ir-maniskill train {self.env_id}; "
-                f"then add --checkpoint runs/{task}/best.safetensors"
+                f"then add --checkpoint runs/{task}/best.safetensors. Or add "
+                "--checkpoint NaoInstruct-v1 --any-task: that policy reads any text"
             )
         return path
 

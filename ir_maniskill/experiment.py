@@ -21,7 +21,17 @@ from typing import Any, Literal
 import torch
 
 from ir_maniskill import checks
-from ir_maniskill.goals import COLORS, SHAPES, GoalError, Instruction, Ref, Touch
+from ir_maniskill.goals import (
+    COLORS,
+    FIXED,
+    SHAPES,
+    Goal,
+    GoalError,
+    Instruction,
+    Push,
+    Ref,
+    Touch,
+)
 from ir_maniskill.language import Thing
 from ir_maniskill.language import words as words_of_language
 from ir_maniskill.language.splits import KINDS, SPLITS
@@ -351,6 +361,12 @@ class Experiment:
                 fits,
                 "exactly one of: " + ", ".join(thing.name for thing in self.bodies),
             )
+        for ref in _pushed(instruction.goal):
+            place = int(ref.resolve(layout)[0].int().argmax())
+            thing, unknown = self.bodies[place], self.shuffled and ref.where is not None
+            what = f"instruction {instruction.text!r}: what it pushes"
+            fits = thing.shape not in FIXED or unknown
+            _require(fits, what, thing.name, "what is not fixed to the table")
 
     def _check_layout(self, objects: tuple[TouchObject, ...]) -> None:
         slack = self.jitter.position * math.sqrt(2)
@@ -370,6 +386,12 @@ class Experiment:
                     f"{gap:.3f} m with jitter, expected at least "
                     f"{OBJECT_SIZE * math.sqrt(2):.3f} m"
                 )
+
+
+def _pushed(goal: Goal) -> list[Ref]:
+    """Return what a goal pushes."""
+    own = [goal.ref] if isinstance(goal, Push) else []
+    return own + [ref for part in goal.parts for ref in _pushed(part)]
 
 
 def touch_instructions(objects: Iterable[TouchObject]) -> tuple[Instruction, ...]:

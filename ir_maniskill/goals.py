@@ -31,7 +31,7 @@ import torch
 from torch import Tensor
 
 from ir_maniskill import checks
-from ir_maniskill.snapshot import Lazy, Snapshot, later
+from ir_maniskill.snapshot import Later, Lazy, Snapshot, later
 
 COLORS: dict[str, tuple[float, float, float]] = {
     "blue": (0.05, 0.16, 0.85),
@@ -192,7 +192,17 @@ class Measure(Lazy):
     """How many goals of a sequence `Then` are reached [N] int64; None: 0."""
 
     def __post_init__(self) -> None:
-        """Have what was left out come later."""
+        """Have what was left out come later.
+
+        Raises:
+            GoalError: `holds`, `gap` or `serves` has no such shape.
+        """
+        for name, dims in {"holds": 1, "gap": 1, "serves": 3}.items():
+            value = vars(self)[name]
+            if not isinstance(value, Later) and getattr(value, "ndim", -1) != dims:
+                got = getattr(value, "shape", repr(value))
+                expected = "a tensor [N]" if dims == 1 else "a tensor [N, F, C]"
+                raise GoalError(f"{name} of a Measure: got {got}, expected {expected}")
         defaults = {
             "bars": lambda: torch.zeros_like(self.serves),
             "level": lambda: self.holds.float(),
@@ -317,6 +327,9 @@ class Push(Goal):
 
     def __post_init__(self) -> None:
         self._check(ref=Ref, distance=Real)
+        if self.ref.shape in FIXED:
+            got = f"got a {self.ref.shape}, which is fixed to the table"
+            raise GoalError(f"Push: {got}, expected what can move")
         _require_choice("direction of Push", self.direction, DIRECTIONS)
         if not 0 < self.distance <= 0.5:
             raise GoalError(f"distance of Push: got {self.distance}, expected 0 to 0.5")

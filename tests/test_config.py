@@ -71,6 +71,10 @@ def test_wrong_configs_say_what_was_got_and_expected(change, message):
         (lambda: PPOConfig(minibatch=4096), "minibatch: got 4096, expected 2 to 2048"),
         (lambda: TrainConfig(threads=1.5), r"threads: got 1.5, .* type int \| None"),
         (lambda: TrainConfig(agent={"hidden": 8}), "agent: got .* type AgentConfig"),
+        (
+            lambda: dataclasses.replace(CONFIGS["listen"], total_steps=5000),
+            "total_steps: got 5000, expected at least 5358: the teacher learns from",
+        ),
         (lambda: PPOConfig(gamma=None), "gamma: got None, expected a .* type float"),
         (lambda: AgentConfig(hidden=[8]), r"hidden: got \[8\], .* type tuple\[int,"),
         (lambda: AgentConfig(hidden=(8.5,)), r"hidden: got \(8.5,\)"),

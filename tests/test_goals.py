@@ -80,6 +80,7 @@ def test_a_reference_that_fits_none_or_two_is_refused_where_it_counts(ref):
         (lambda: Touch("blue cube"), "ref of Touch: got 'blue cube', expected a Ref"),
         (lambda: Push(RED, "up"), "direction of Push: got 'up', available: left"),
         (lambda: Push(RED, "left", -1.0), "distance of Push: got -1.0"),
+        (lambda: Push(Ref("red", "button"), "left"), "Push: got a button, .* fixed to"),
         (lambda: Both(Touch(RED), Then(Touch(RED), Touch(BLUE))), "a Then around it"),
         (lambda: Then(Then(Touch(RED), Touch(RED)), Touch(RED)), "expected it as `b`"),
     ],
@@ -250,3 +251,25 @@ def test_a_field_that_cannot_be_stacked_is_refused():
 
     with pytest.raises(GoalError, match="direction of a goal: got 'up', available: l"):
         GoalTable([Lift(RED)], HANDS, CPU)
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        ({"gap": 0}, r"gap of a Measure: got 0, expected a tensor \[N\]"),
+        ({"holds": torch.ones(1, 2)}, r"holds .* got torch.Size\(\[1, 2\]\), expected"),
+        ({"serves": torch.ones(1)}, r"serves .* expected a tensor \[N, F, C\]"),
+        (None, r"Hop.measure: got tensor\(.*, expected a Measure"),
+    ],
+)
+def test_a_measure_of_the_wrong_kind_is_refused(answer, message):
+    class Hop(Avoid):
+        @staticmethod
+        def measure(scene, asked):
+            measure = Avoid.measure(scene, asked)
+            if answer is None:
+                return measure.holds
+            return dataclasses.replace(measure, **answer)
+
+    with pytest.raises(GoalError, match=message):
+        measured(Hop(RED), scene())

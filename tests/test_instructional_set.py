@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from scenes import HANDS
 
 from ir_maniskill import experiment as catalog
+from ir_maniskill.environment.arguments import instructions_of
 from ir_maniskill.environment.instructional_set import InstructionalSet
 from ir_maniskill.experiment import Experiment, TouchObject
 from ir_maniskill.goals import Instruction, Ref, Touch
@@ -90,3 +91,9 @@ def test_a_word_that_is_not_in_the_vocabulary_is_warned_of_once(caplog) -> None:
     assert caplog.text.strip().endswith("not in the vocabulary: kindly")
     Experiment("Kind-v1", (blue,), (said,))  # its words are those of the sentence
     assert len(caplog.records) == 1
+
+
+def test_words_that_a_task_does_not_know_are_warned_of_when_they_are_told(caplog):
+    triangle = catalog.get("NaoTouchCubeTriangle-v1")
+    instructions_of("Push the red cube left", triangle, 1)
+    assert caplog.text.strip().endswith("not in the vocabulary: push, left")

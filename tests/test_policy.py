@@ -10,6 +10,7 @@ import torch
 
 import ir_maniskill
 from ir_maniskill import experiment as catalog
+from ir_maniskill.checks import ConfigError
 from ir_maniskill.environment.robots import Nao
 from ir_maniskill.environment.senses import StateStack, read_text
 from ir_maniskill.policy import shipped
@@ -129,6 +130,8 @@ def test_what_cannot_be_loaded_says_what_can(tmp_path):
         ir_maniskill.load_policy("Nao-v1")
     with pytest.raises(CheckpointError, match="expected .* a run's folder with a best"):
         ir_maniskill.load_policy(tmp_path)
+    with pytest.raises(ConfigError, match="policy: got .*`audit` takes any function"):
+        ir_maniskill.evaluate(lambda obs: obs, TASK)
 
 
 @pytest.mark.render

@@ -27,6 +27,7 @@ from ir_maniskill.training import train as training
 from ir_maniskill.training.algorithm import under
 from ir_maniskill.training.checkpoint import CheckpointError, MismatchError
 from ir_maniskill.training.config import (
+    CONFIGS,
     AgentConfig,
     ConfigError,
     TrainConfig,
@@ -384,6 +385,15 @@ def test_a_task_is_named_with_its_module_as_elsewhere(monkeypatch):
     assert train(TrainConfig(env_id=name)).env_id == "NaoTouchCubeSingle-v1"
 
 
+def test_a_dict_changes_some_numbers_of_a_part(monkeypatch):
+    monkeypatch.setattr(training, "run", lambda config, *_: config)
+    config = train("NaoTouchCubeSingle-v1", preset="paper", ppo={"gamma": 0.5})
+    paper = CONFIGS["paper"].ppo
+    assert config.ppo == dataclasses.replace(paper, gamma=0.5)
+    with pytest.raises(ConfigError, match="argument ppo of train: got 'gama', avail"):
+        train("NaoTouchCubeSingle-v1", ppo={"gama": 0.5})
+
+
 # -- Refusals --------------------------------------------------------------------------
 
 
@@ -394,6 +404,8 @@ def test_a_number_that_there_is_not_is_refused_by_what_there_is():
         train("NaoTouchCubeSingle-v1", preset="fast")
     with pytest.raises(ConfigError, match="task: got Exp.*expected an id or a TrainC"):
         train(TASK)
+    with pytest.raises(ConfigError, match="preset: got 'paper', expected none beside"):
+        train(TrainConfig(), preset="paper")
 
 
 def test_a_folder_with_a_run_is_not_overwritten(tmp_path):

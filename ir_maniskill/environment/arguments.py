@@ -15,7 +15,7 @@ from ir_maniskill.environment.senses import text_of
 from ir_maniskill.experiment import Experiment, Spoken
 from ir_maniskill.goals import GoalError, Instruction
 from ir_maniskill.language import SentenceError, handwritten, parse
-from ir_maniskill.language.tokens import split_words
+from ir_maniskill.language.tokens import split_words, warn_of_unknown
 
 RESET_OPTIONS = ("instruction", "reconfigure", "reset_to_env_states")
 """Names of the options that a reset of all envs takes."""
@@ -80,8 +80,12 @@ def _instruction(given: Any, experiment: Experiment) -> Instruction:
     if isinstance(given, Instruction):
         return given
     if isinstance(given, str):
-        same = (i for i in own if _bare(i.text) == _bare(given))
-        return next(same, None) or Instruction(given, parse(given))
+        for same in own:
+            if _bare(same.text) == _bare(given):
+                return same
+        told = Instruction(given, parse(given))
+        warn_of_unknown(given, experiment.vocabulary)
+        return told
     if _whole(given) and given in range(len(experiment.sentences)):
         return own[given]
     raise LookupError

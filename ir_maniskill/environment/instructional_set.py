@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ir_maniskill.checks import require_choice
+from ir_maniskill.checks import require_choice, require_type
 from ir_maniskill.environment.senses import TEXT_BYTES, text_of, tokens_of
 from ir_maniskill.experiment import Experiment, Spoken
 from ir_maniskill.goals import (
@@ -102,9 +102,9 @@ class GoalBatch:
     def measure(self, scene: Snapshot) -> Measure:
         """Measure the goal of each scene."""
         (_, kind, asked), *others = self.parts
-        measure = kind.measure(scene, asked)
+        measure = _measured(kind, scene, asked)
         for chosen, kind, asked in others:
-            measure = Measure.where(chosen, kind.measure(scene, asked), measure)
+            measure = Measure.where(chosen, _measured(kind, scene, asked), measure)
         return measure
 
     def rows(self, index: Tensor) -> GoalBatch:
@@ -118,6 +118,12 @@ class GoalBatch:
             picked = {name: pick(value) for name, value in vars(asked).items()}
             parts.append((chosen[index], kind, SimpleNamespace(**picked)))
         return GoalBatch(tuple(parts))
+
+
+def _measured(kind: type[Goal], scene: Snapshot, asked: SimpleNamespace) -> Measure:
+    measure = kind.measure(scene, asked)
+    require_type(f"{kind.__name__}.measure", measure, Measure, GoalError)
+    return measure
 
 
 class GoalTable:

@@ -214,10 +214,10 @@ class TrainConfig:
         require(fits, "senses", senses, "no 'state', which tells one sentence's")
         gain = self.agent.posture_gain
         require(gain == 0, "posture_gain", gain, "0 with 'sac'")
-        taught = self.total_steps * self.sac.policy_from
-        expected = f"more: the teacher learns from {start} (sac.random_steps) until "
-        expected += f"{taught:.0f} (sac.policy_from)"
-        require(taught > start, "total_steps", self.total_steps, expected)
+        least = math.floor(start / self.sac.policy_from) + 1
+        expected = f"at least {least}: the teacher learns from {start} "
+        expected += f"(sac.random_steps) on, in {self.sac.policy_from:g} of the steps"
+        require(self.total_steps >= least, "total_steps", self.total_steps, expected)
 
     @property
     def steps_per_env(self) -> int:

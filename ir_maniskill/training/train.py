@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import functools
 import logging
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -65,8 +66,9 @@ def train(
         algorithm: What learns; None: what the config names.
         preset: Which of `CONFIGS` to train a task with; a run that is resumed keeps
             its own.
-        **changes: Fields that shall be other than in the preset, or in `task`. With
-            `init_from`, the policy decides instead of the preset what its weights need.
+        **changes: Fields that shall be other than in the preset, or in `task`; a dict
+            changes some of a part, e.g. `ppo={"gamma": 0.95}`. With `init_from`, the
+            policy decides instead of the preset what its weights need.
 
     Raises:
         CheckpointError: If the folder or its checkpoint cannot be used, or there is no
@@ -89,10 +91,12 @@ def train(
         changes = {"env_id": task, "out": f"runs/{task}", **changes}
         stored = stored_config(Path(changes["out"])) if resume else None
         usual = stored or beginning_with(changes.get("init_from"), CONFIGS[preset])
-        config = dataclasses.replace(usual, **changes)
+        config = _changed(usual, changes)
     else:
         require(isinstance(task, TrainConfig), "task", task, "an id or a TrainConfig")
-        config = dataclasses.replace(task, **changes)
+        expected = "none beside a TrainConfig, which has all numbers"
+        require(preset == "default", "preset", preset, expected)
+        config = _changed(task, changes)
         if ":" in config.env_id:
             env_id = catalog.get(config.env_id).id  # without its module
             config = dataclasses.replace(config, env_id=env_id)
@@ -106,6 +110,18 @@ def train(
             )
             config = resumed(stored, dataclasses.replace(config, agent=agent))
     return run(config, resume, envs, eval_envs, algorithm)
+
+
+def _changed(config: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
+    """Return the config with other fields; a dict changes some of a part's."""
+    values = dict(changes)
+    for name, value in changes.items():
+        part = getattr(config, name, None)
+        if isinstance(value, Mapping) and dataclasses.is_dataclass(part):
+            for field in value:
+                require_choice(f"argument {name} of train", field, vars(part))
+            values[name] = dataclasses.replace(part, **value)
+    return dataclasses.replace(config, **values)
 
 
 def run(
