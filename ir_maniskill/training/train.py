@@ -117,7 +117,7 @@ def _changed(config: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
     values = dict(changes)
     for name, value in changes.items():
         part = getattr(config, name, None)
-        if isinstance(value, Mapping) and dataclasses.is_dataclass(part):
+        if isinstance(value, Mapping) and hasattr(part, "__dataclass_fields__"):
             for field in value:
                 require_choice(f"argument {name} of train", field, vars(part))
             values[name] = dataclasses.replace(part, **value)
