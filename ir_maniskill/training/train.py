@@ -116,7 +116,7 @@ def _changed(config: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
     """Return the config with other fields; a dict changes some of a part's."""
     values = dict(changes)
     for name, value in changes.items():
-        part = getattr(config, name, None)
+        part: Any = vars(config).get(name)
         if isinstance(value, Mapping) and hasattr(part, "__dataclass_fields__"):
             for field in value:
                 require_choice(f"argument {name} of train", field, vars(part))
