@@ -244,6 +244,9 @@ def test_a_field_that_cannot_be_stacked_is_refused():
     with pytest.raises(GoalError, match="field 'song' of a goal: got 'la', expected"):
         GoalTable([Sing(RED)], HANDS, CPU)
 
+    with pytest.raises(GoalError, match="got 'la' and None, .* same in all goals"):
+        GoalTable([Sing(RED), Sing(RED, None)], HANDS, CPU)
+
     @dataclasses.dataclass(frozen=True)
     class Lift(Avoid):
         direction: str = "up"
