@@ -2,11 +2,14 @@
 
 import dataclasses
 import math
+import runpy
+from pathlib import Path
 
 import pytest
 import torch
 from scenes import HANDS, scene
 
+import ir_maniskill
 from ir_maniskill import Avoid, Both, Push, Ref, Then, Touch
 from ir_maniskill.environment.instructional_set import GoalTable
 from ir_maniskill.environment.reward_generator import judge
@@ -207,6 +210,19 @@ def test_then_goes_on_when_the_first_is_reached():
     assert not verdict.foul  # a finger may still be on red
     last, _ = measured(goal, scene((0, 2), stage=2))
     assert (last.holds.item(), last.stage.item(), last.level.item()) == (True, 2, 3.0)
+
+
+@pytest.mark.parametrize("turn", [-2.5, -1.5, 0.0, 1.5, 2.5, 2 * math.pi - 2.5])
+def test_the_verb_of_the_example_measures_turns_either_way(turn, monkeypatch):
+    monkeypatch.setattr(ir_maniskill, "register", lambda task: task)
+    example = Path(__file__).parents[1] / "examples" / "new_verb.py"
+    spin = runpy.run_path(str(example))["Spin"]
+    at = scene((0, 1))
+    at.pose[:, 1, 3], at.pose[:, 1, 6] = math.cos(turn / 2), math.sin(turn / 2)
+    held, verdict = measured(spin(RED, 2.0), at)
+    left = 2.0 - min(abs(turn), 2.5)
+    assert held.holds.item() == (left < 0) and not verdict.foul
+    assert held.gap.item() == pytest.approx(max(0.03 * left, 0), abs=1e-5)
 
 
 # -- Batches -------------------------------------------------------------------------
