@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import copy
-from importlib import resources
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
@@ -15,6 +14,7 @@ from torch import Tensor
 from ir_maniskill import experiment as catalog
 from ir_maniskill.agent.agent import Agent
 from ir_maniskill.agent.language_system import encoder_of
+from ir_maniskill.assets import FOLDER
 from ir_maniskill.checks import require
 from ir_maniskill.environment.robots.robot import Robot, short_name
 from ir_maniskill.environment.senses import (
@@ -227,8 +227,7 @@ def load_policy(
 
 def shipped(task_id: str) -> Path:
     """Return where the policy of a task is, if it ships with the package."""
-    folder = resources.files("ir_maniskill.assets") / "policies"
-    return Path(str(folder / f"{task_id}.safetensors"))
+    return FOLDER / "policies" / f"{task_id}.safetensors"
 
 
 def _difference(name: str, got: Any, expected: Any) -> str:
