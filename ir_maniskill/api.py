@@ -28,7 +28,7 @@ from ir_maniskill.experiment import Experiment
 from ir_maniskill.policy import Policy, load_policy
 
 PolicyLike = Policy | str | Path
-"""A policy, the file of one, or the id of a task whose policy ships."""
+"""A policy, or what `load_policy` takes: a file, a run's folder, a task's id."""
 
 
 def evaluate(

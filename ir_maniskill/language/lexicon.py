@@ -25,7 +25,7 @@ WORDS = FOLDER / "language"
 ENDINGS = ("s", "es", "ed", "ing")
 """What content words may end with besides."""
 TURNS = ("ward", "wards")
-"""What any word may end with besides, e.g. "left"."""
+"""What any word may end with besides: "leftwards" is read as "left"."""
 NEIGHBORS = 3
 """How many known words an unknown one is a mixture of, at most."""
 CROWD = 100
