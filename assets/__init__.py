@@ -1,1 +1,6 @@
-"""Models the environments are built from, one folder per robot."""
+"""What is loaded from files: robot, scene, shaders, word vectors and policies."""
+
+from pathlib import Path
+
+FOLDER = Path(__file__).parent
+"""Where they are."""

@@ -26,7 +26,7 @@ class Spin(Goal):
     @staticmethod
     def measure(scene: Snapshot, asked: SimpleNamespace) -> Measure:
         """Hold where the object has turned so far; touching another is a foul."""
-        turned = (yaw(scene.pose) - yaw(scene.start)).sin().abs().asin()  # [N, C]
+        turned = (yaw(scene.pose) - yaw(scene.start)).cos().acos()  # [N, C], to pi
         turned = (turned * asked.ref).sum(dim=1)  # [N]
         gap = 0.03 * (asked.angle - turned).clamp(min=0)  # [m] along the cube's edge
         serves = asked.ref[:, None].expand_as(scene.contact)  # [N, F, C]

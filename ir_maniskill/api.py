@@ -28,7 +28,7 @@ from ir_maniskill.experiment import Experiment
 from ir_maniskill.policy import Policy, load_policy
 
 PolicyLike = Policy | str | Path
-"""A policy, the file of one, or the id of a task whose policy ships."""
+"""A policy, or what `load_policy` takes: a file, a run's folder, a task's id."""
 
 
 def evaluate(
@@ -64,10 +64,9 @@ def evaluate(
         MismatchError: It was trained for another task, robot or vocabulary.
         ValueError: There is no such sentence, or too few episodes.
     """
-    robot = env_kwargs.get("robot_uids")
     require_whole("num_envs", num_envs, 1)
     policy, experiment, chosen = _prepare(
-        policy, task, any_task, episodes, seed, instruction, robot
+        policy, task, any_task, episodes, seed, instruction, env_kwargs
     )
     kwargs = {**policy.env_kwargs, **env_kwargs}
     # More envs than episodes would play what nobody counts.
@@ -109,9 +108,8 @@ def audit(
     split = env_kwargs.get("split")
     require(split is None, "split", split, "none: an audit plays all there are")
     if isinstance(policy, Policy | str | Path):
-        robot = env_kwargs.get("robot_uids")
         policy, experiment, _ = _prepare(
-            policy, task, any_task, episodes, seed, None, robot
+            policy, task, any_task, episodes, seed, None, env_kwargs
         )
         player = player_of(policy.agent.policy, policy.config.frames)
         kwargs = policy.env_kwargs
@@ -169,7 +167,7 @@ def record(
     plays = isinstance(speed, float | int) and 0.05 <= speed <= 4
     require(plays, "speed", speed, "0.05 to 4")
     policy, experiment, chosen = _prepare(
-        policy, task, any_task, episodes, seed, instruction
+        policy, task, any_task, episodes, seed, instruction, {}
     )
     steps = video.record(
         policy.agent.policy,
@@ -192,9 +190,9 @@ def _prepare(
     episodes: int,
     seed: int,
     instruction: str | None,
-    robot: str | None = None,
+    env_kwargs: dict[str, Any],
 ) -> tuple[Policy, Experiment, list[str] | None]:
-    """Check what both ask for; return the policy, the task and what to say."""
+    """Check what is asked for; return the policy, the task and what to say."""
     require_whole("episodes", episodes, 1)
     require_whole("seed", seed, 0, SEEDS[-1] - 2 * episodes)  # the last ones'
     expected = "a Policy, a task's id or a file; `audit` takes any function"
@@ -202,7 +200,7 @@ def _prepare(
     if not isinstance(policy, Policy):
         policy = load_policy(policy)
     experiment = catalog.get(task or policy.env_id)
-    policy.require_match(experiment, robot, any_task=any_task)
+    policy.require_match(experiment, env_kwargs.get("robot_uids"), any_task=any_task)
     wanted = None if instruction is None else [instruction]
-    choose_instructions(experiment, wanted)
+    choose_instructions(experiment.in_split(env_kwargs.get("split") or "train"), wanted)
     return policy, experiment, wanted

@@ -48,7 +48,7 @@ SENSES = ("vision", "proprioception", "touch")
 """The sensory modules that the Perceptual System may use."""
 
 OBJECT_SIZE = 0.04
-"""Edge of a cube and diameter of a button [m]."""
+"""Edge of a cube, and diameter of a button and a can [m]."""
 
 TABLE = ((0.10, 0.40), (-0.34, 0.34))
 """Extent of the table top along x and y [m]."""
@@ -117,7 +117,7 @@ class Drawn:
     apart: float = 0.065
     """Least distance between their centers [m]."""
     held_out: Area = ((0.14, 0.26), (0.03, 0.07))
-    """Where something may lie, but is never named, but for the split `places` [m]."""
+    """What lies in here is named in the split `places` alone [m]."""
 
     def __post_init__(self) -> None:
         for name, known in (("colors", COLORS), ("shapes", SHAPES)):

@@ -30,7 +30,8 @@ def replacing(path: Path) -> Iterator[Path]:
                 os.fsync(file.fileno())
             aside.replace(target)
     finally:
-        aside.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # else it hides the clear one
+            aside.unlink()
 
 
 def write_json(path: Path, data: Any) -> None:
@@ -50,8 +51,8 @@ def require_writable(path: Path, endings: Sequence[str] = ()) -> None:
         expected = f"a name ending in {' or '.join(endings)}"
         raise ValueError(f"file: got {path}, expected {expected}")
     target = path.resolve()
-    new = not target.exists()
     with writing(path):
+        new = not target.exists()
         target.parent.mkdir(parents=True, exist_ok=True)
         target.open("ab").close()
         if new:

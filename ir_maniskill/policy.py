@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from importlib import resources
+from copy import copy
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
@@ -14,6 +14,7 @@ from torch import Tensor
 from ir_maniskill import experiment as catalog
 from ir_maniskill.agent.agent import Agent
 from ir_maniskill.agent.language_system import encoder_of
+from ir_maniskill.assets import FOLDER
 from ir_maniskill.checks import require
 from ir_maniskill.environment.robots.robot import Robot, short_name
 from ir_maniskill.environment.senses import (
@@ -93,16 +94,18 @@ class Policy:
         Raises:
             ValueError: The observation lacks something, a sentence is too long, there
                 are neither one nor N, or N is not that of the last observation:
-                `reset()` comes before that.
+                `reset()` comes before that. The history stays as it was.
         """
-        state = self._see(obs)
+        stack, state = self._see(obs)
         rows = state["instruction"]
         if sentences is not None:
             said = [sentences] * len(rows) if isinstance(sentences, str) else sentences
             expected = f"one for all, or {len(rows)}, one for each env"
             require(len(said) == len(rows), "sentences", said, expected)
             state |= self.read(said)
-        return self.agent.policy(state).to(rows.device)
+        actions = self.agent.policy(state).to(rows.device)
+        self._stack, self._count, self._done = stack, len(rows), None
+        return actions
 
     def read(self, sentences: Sequence[str]) -> State:
         """Return the entries of the state that tell it these sentences."""
@@ -172,22 +175,23 @@ class Policy:
         agent.load_state_dict(weights, strict=False)
         return len(weights)
 
-    def _see(self, obs: Observation) -> State:
-        """Add an observation to the history, and return the state."""
+    def _see(self, obs: Observation) -> tuple[StateStack, State]:
+        """Return the history with an observation added, and the state."""
         told = isinstance(obs, Mapping) and obs.get("extra", {}).get("instruction")
         expected = "a dict of tensors, with what is said: make the env with the "
         expected += "policy's `env_kwargs`"
         require(isinstance(told, Tensor), "observation", type(obs).__name__, expected)
-        done, self._done, count = self._done, None, len(obs["extra"]["instruction"])
         if self._stack is None:
-            self._stack, self._count = StateStack(self.config.frames), count
-            return self._stack.reset(obs)
+            stack = StateStack(self.config.frames)
+            return stack, stack.reset(obs)
+        count = len(obs["extra"]["instruction"])
         if count != self._count:
             raise ValueError(
                 f"observation: got one of {count} envs, expected {self._count} as "
                 "before; call reset() before other envs are played"
             )
-        return self._stack.push(obs, done)
+        stack = copy(self._stack)
+        return stack, stack.push(obs, self._done)
 
 
 def load_policy(
@@ -223,8 +227,7 @@ def load_policy(
 
 def shipped(task_id: str) -> Path:
     """Return where the policy of a task is, if it ships with the package."""
-    folder = resources.files("ir_maniskill.assets") / "policies"
-    return Path(str(folder / f"{task_id}.safetensors"))
+    return FOLDER / "policies" / f"{task_id}.safetensors"
 
 
 def _difference(name: str, got: Any, expected: Any) -> str:

@@ -48,7 +48,6 @@ def ship(run: Path, episodes: int, scenes: int) -> EvaluationReport:
         figures["same_scene"] = {"scenes": scenes, **exclusive}
     # Only now: what shipped before stays until the new figures are there.
     path = FOLDER / f"{task}.safetensors"
-    path.parent.mkdir(exist_ok=True)
     metadata = {**stored.metadata, "evaluation": figures}
     checkpoint.write(path, dataclasses.replace(stored, metadata=metadata))
     origin = {"run": run.resolve().name, "steps": stored.metadata["steps"]}

@@ -127,6 +127,14 @@ def test_what_is_no_file_is_not_replaced_and_a_link_stays(tmp_path):
     assert pipe.is_fifo() and link.is_symlink() and file.read_text() == "{}\n"
 
 
+@pytest.mark.parametrize("name", ["file/inside", 99 * "long"])
+def test_where_no_file_can_be_the_path_is_named(name, tmp_path):
+    (tmp_path / "file").touch()
+    for write in (files.require_writable, lambda path: files.write_json(path, {})):
+        with pytest.raises(OSError, match=f"cannot write {tmp_path / name}: "):
+            write(tmp_path / name)
+
+
 @pytest.mark.parametrize("arguments", [[], ["dance"], ["train"], ["evaluate"]])
 def test_incomplete_commands_exit_with_2(arguments, capsys):
     with pytest.raises(SystemExit) as stop:

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import ir_maniskill
+from ir_maniskill import api
 from ir_maniskill.evaluation import evaluate
 from ir_maniskill.evaluation.audit import same_scene
 from ir_maniskill.evaluation.evaluate import (
@@ -245,3 +246,14 @@ def test_real_scores_are_equal_in_any_order_and_company(multi_vec, reflex):
         halves = [getattr(part.overall, name) for part in (first, later)]
         assert sum(halves) / 2 == pytest.approx(getattr(whole.overall, name))
     assert whole.overall.right_fingers + whole.overall.wrong_fingers > 0
+
+
+def test_a_sentence_of_a_split_is_played_in_that_split(monkeypatch):
+    envs = SimpleNamespace(close=lambda: None)
+    monkeypatch.setattr(api, "make_vec", lambda *_, **__: envs)
+    monkeypatch.setattr(api, "evaluate_policy", lambda *_, **told: told["instructions"])
+    said = {"instruction": "red cube pls"}  # written by hand, for "wording" alone
+    told = ir_maniskill.evaluate("NaoInstruct-v1", split="wording", **said)
+    assert told == ["red cube pls"]
+    with pytest.raises(ValueError, match="got 'pls' as word 3"):
+        ir_maniskill.evaluate("NaoInstruct-v1", **said)

@@ -2,11 +2,14 @@
 
 import dataclasses
 import math
+import runpy
+from pathlib import Path
 
 import pytest
 import torch
 from scenes import HANDS, scene
 
+import ir_maniskill
 from ir_maniskill import Avoid, Both, Push, Ref, Then, Touch
 from ir_maniskill.environment.instructional_set import GoalTable
 from ir_maniskill.environment.reward_generator import judge
@@ -210,6 +213,19 @@ def test_then_goes_on_when_the_first_is_reached():
     assert (last.holds.item(), last.stage.item(), last.level.item()) == (True, 2, 3.0)
 
 
+@pytest.mark.parametrize("turn", [-2.5, -1.5, 0.0, 1.5, 2.5, 2 * math.pi - 2.5])
+def test_the_verb_of_the_example_measures_turns_either_way(turn, monkeypatch):
+    monkeypatch.setattr(ir_maniskill, "register", lambda task: task)
+    example = Path(__file__).parents[1] / "examples" / "new_verb.py"
+    spin = runpy.run_path(str(example))["Spin"]
+    at = scene((0, 1))
+    at.pose[:, 1, 3], at.pose[:, 1, 6] = math.cos(turn / 2), math.sin(turn / 2)
+    held, verdict = measured(spin(RED, 2.0), at)
+    left = 2.0 - min(abs(turn), 2.5)
+    assert held.holds.item() == (left < 0) and not verdict.foul
+    assert held.gap.item() == pytest.approx(max(0.03 * left, 0), abs=1e-5)
+
+
 # -- Batches -------------------------------------------------------------------------
 
 
@@ -244,6 +260,9 @@ def test_a_field_that_cannot_be_stacked_is_refused():
 
     with pytest.raises(GoalError, match="field 'song' of a goal: got 'la', expected"):
         GoalTable([Sing(RED)], HANDS, CPU)
+
+    with pytest.raises(GoalError, match="got 'la' and None, .* same in all goals"):
+        GoalTable([Sing(RED), Sing(RED, None)], HANDS, CPU)
 
     @dataclasses.dataclass(frozen=True)
     class Lift(Avoid):

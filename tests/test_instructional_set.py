@@ -83,11 +83,11 @@ def test_uniform_numbers_pick_every_instruction_equally() -> None:
 
 def test_a_word_that_is_not_in_the_vocabulary_is_warned_of_once(caplog) -> None:
     blue = TouchObject("blue", (0.20, 0.0))
-    said = Instruction("Kindly touch the blue cube.", Touch(Ref("blue")))
+    said = Instruction("Kindly, kindly touch the blue cube.", Touch(Ref("blue")))
     for _ in range(3):
         Experiment("Kind-v1", (blue,), (said,), vocabulary=VOCABULARY)
     assert [record.levelname for record in caplog.records] == ["WARNING"]
-    assert "'Kindly touch the blue cube.'" in caplog.text
+    assert "'Kindly, kindly touch the blue cube.'" in caplog.text
     assert caplog.text.strip().endswith("not in the vocabulary: kindly")
     Experiment("Kind-v1", (blue,), (said,))  # its words are those of the sentence
     assert len(caplog.records) == 1

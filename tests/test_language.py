@@ -138,6 +138,7 @@ def test_sentences_read_as_people_read_them(sentence, goal):
         ("Push the red cube", "got the end, expected one of: away, closest"),
         ("Touch the red cube blue", "got 'blue' as word 5, .*, the end$"),
         ("", "got the end, expected one of: contact, could"),
+        ("please " * 300 + "touch it", "got 302 words, expected at most 100"),
     ],
 )
 def test_what_is_not_understood_is_named_with_what_was_expected(sentence, message):

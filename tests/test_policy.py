@@ -57,6 +57,22 @@ def test_it_acts_on_its_own_history(policy):
     assert torch.equal(policy.act(seen[0]), policy.agent.policy(stack.reset(seen[0])))
 
 
+def test_what_it_cannot_act_on_it_has_not_seen(policy):
+    seen, stack = [observed() for _ in range(3)], StateStack(3)
+    policy.reset()
+    with pytest.raises(ValueError, match="images of the state: got nothing"):
+        policy.act({name: seen[0][name] for name in ("agent", "extra")})
+    assert torch.equal(policy.act(seen[0]), policy.agent.policy(stack.reset(seen[0])))
+    done = torch.tensor([True, False])
+    policy.reset(done)
+    with pytest.raises(ValueError, match="got one of 3 envs"):
+        policy.act(observed(3))
+    with pytest.raises(ValueError, match="sentence of 17 tokens"):
+        policy.act(seen[1], "the " * 17)
+    expected = policy.agent.policy(stack.push(seen[2], done))
+    assert torch.equal(policy.act(seen[2]), expected)
+
+
 def test_other_envs_come_after_a_reset(policy):
     policy.reset()
     policy.act(observed(2))

@@ -170,7 +170,7 @@ def palette(colors: Sequence[tuple[int, int, int]]) -> Image.Image:
     """Return the palette: a column per color, the brightest row on top."""
     brightness = np.linspace(1.0, _DARKEST, _LEVELS)[:, None, None]  # [L, 1, 1]
     row = np.repeat(np.array(colors, float), _SWATCH_WIDTH, axis=0)  # [W, 3]
-    return Image.fromarray(np.rint(row * brightness).astype(np.uint8), "RGB")
+    return Image.fromarray(np.rint(row * brightness).astype(np.uint8))
 
 
 def bake(

@@ -1,1 +1,1 @@
-"""What stands around the robot: the room with its table, and the button."""
+"""What stands around the robot: the room with its table, and the shapes on it."""

@@ -91,27 +91,22 @@ def room() -> Surface:
 def turned(profile: tuple[tuple[float, float], ...]) -> trimesh.Trimesh:
     """Return a round body that stands upright; its color is given at load."""
     sections = [Section(at, (radius, radius), 0) for at, radius in profile]
-    return _plain(loft("x", SEGMENTS, sections).turned(0, -np.pi / 2, 0))
+    upright = loft("x", SEGMENTS, sections).turned(0, -np.pi / 2, 0)
+    mesh = bake(upright, ((255, 255, 255),), _LIGHT)
+    normals = mesh.vertex_normals  # all that is kept of it
+    return trimesh.Trimesh(
+        mesh.vertices, mesh.faces, vertex_normals=normals, process=False
+    )
 
 
 def pyramid(low: float, high: float) -> trimesh.Trimesh:
-    """Return a slice of the pyramid, between shares of its height."""
+    """Return a slice of the pyramid, between shares of its height; likewise."""
     corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * PYRAMID_EDGE / 2
     rings = [
         np.column_stack([corners * (1 - at), np.full(4, PYRAMID_HEIGHT * (at - 0.5))])
         for at in (low, high)
     ]
-    return _plain(trimesh.convex.convex_hull(np.vstack(rings)))
-
-
-def _plain(mesh: Surface | trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return the mesh without colors, so that the one given at load is its own."""
-    if isinstance(mesh, Surface):
-        mesh = bake(mesh, ((255, 255, 255),), _LIGHT)
-        normals = mesh.vertex_normals
-        return trimesh.Trimesh(
-            mesh.vertices, mesh.faces, vertex_normals=normals, process=False
-        )
+    mesh = trimesh.convex.convex_hull(np.vstack(rings))
     mesh.unmerge_vertices()  # flat faces
     return mesh
 

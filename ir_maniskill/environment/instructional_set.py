@@ -188,9 +188,10 @@ def _column(name: str, values: list[Any], hands: Mapping[str, Tensor]) -> Deal:
         return _indexed(torch.tensor([DIRECTIONS[v] for v in values], device=device))
     if all(isinstance(value, Real) for value in values):
         return _indexed(torch.tensor(values, dtype=torch.float32, device=device))
+    got = " and ".join({type(value): repr(value) for value in values}.values())
     raise GoalError(
-        f"field {name!r} of a goal: got {values[0]!r}, expected a Ref, a Goal, a "
-        "number, or a field named `hand` or `direction`"
+        f"field {name!r} of a goal: got {got}, expected a Ref, a Goal, a number, or a "
+        "field named `hand` or `direction`; the same in all goals of its kind"
     )
 
 

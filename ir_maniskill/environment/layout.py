@@ -20,7 +20,7 @@ from ir_maniskill.language import Allows, Thing
 CANDIDATES = 40
 """Places that are tried for each object; if none is free it is left out."""
 NAMED_FIRST = 2
-"""How many objects lie in the part held out, where only such may be named."""
+"""How many objects the split `places` lays in the part held out: those it names."""
 
 # What a hand can do, as found with NAO's scripted solution: `evaluation/scripted.py`.
 ACROSS = 0.04

@@ -156,7 +156,7 @@ class Speaker:
 
     def is_true(self, goal: Goal, scene: Sequence[Thing]) -> bool:
         """Return whether each of a goal's references fits one object of a scene."""
-        return None not in [resolve(ref, scene) for ref in goal.refs]
+        return all(resolve(ref, scene) is not None for ref in goal.refs)
 
     def can_ask(self, goal: Goal, scene: Sequence[Thing]) -> bool:
         """Return whether a goal that is true can be asked for in training's scenes."""

@@ -8,7 +8,6 @@ software rendering draw calls and vertices are what pictures cost.
 from __future__ import annotations
 
 import math
-from importlib.resources import files
 
 import numpy as np
 import sapien
@@ -24,6 +23,7 @@ from mani_skill.utils.sapien_utils import look_at
 from mani_skill.utils.structs import Actor, Pose
 from torch import Tensor
 
+from ir_maniskill.assets import FOLDER
 from ir_maniskill.assets.nao import SOLE_HEIGHT
 from ir_maniskill.environment.robots.robot import Robot
 from ir_maniskill.experiment import OBJECT_SIZE, TABLE, TouchObject
@@ -48,7 +48,7 @@ SHELF_STEP = 0.2
 STAND_COLOR = (0.18, 0.19, 0.21)
 """Linear RGB of the pillar of a robot that has no feet."""
 
-_MESHES = files("ir_maniskill.assets") / "scene"
+_MESHES = FOLDER / "scene"
 
 
 def _rgb(data: Tensor) -> dict[str, Tensor]:
@@ -72,7 +72,7 @@ TRIVIAL = ShaderConfig(
 )
 """SAPIEN's cheapest pack: base colors without lights. ManiSkill has no entry for it."""
 UNLIT = ShaderConfig(
-    shader_pack=str(files("ir_maniskill.assets") / "shaders" / "unlit"),
+    shader_pack=str(FOLDER / "shaders" / "unlit"),
     texture_names={"Color": ["rgb"]},
     texture_transforms={"Color": _rgb},
 )

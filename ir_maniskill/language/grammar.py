@@ -42,6 +42,9 @@ TRAIN = ("train",)
 SAID = ("train", "wording")
 """What is said in training, and what at all."""
 
+LONGEST = 100
+"""Most words of a sentence to read: each {polite} one is one more level of calls."""
+
 SYMBOLS = {"a": "act", "b": "act", "other": "ref"}
 """What a slot stands for, where that is not its name."""
 
@@ -333,7 +336,11 @@ def parse(sentence: str, wording: bool = True) -> Goal:
     Raises:
         SentenceError: It is not understood.
     """
-    reader = _Reader(words := split_words(sentence), MARKS if wording else TRAIN)
+    words = split_words(sentence)
+    if len(words) > LONGEST:
+        expected = f"expected at most {LONGEST}"
+        raise SentenceError(f"sentence: got {len(words)} words, {expected}")
+    reader = _Reader(words, MARKS if wording else TRAIN)
     goals = {goal for end, goal in reader.read("sentence", 0) if end == len(words)}
     if not goals:
         raise SentenceError(f"sentence {sentence!r}: {_complaint(reader)}")

@@ -13,18 +13,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from difflib import get_close_matches
 from functools import cache, cached_property, lru_cache
-from importlib import resources
-from pathlib import Path
 from threading import Lock
 
 import numpy as np
 
+from ir_maniskill.assets import FOLDER
 from ir_maniskill.language.tokens import UNK, split_words
 
+WORDS = FOLDER / "language"
+"""Where the files are."""
 ENDINGS = ("s", "es", "ed", "ing")
 """What content words may end with besides."""
 TURNS = ("ward", "wards")
-"""What any word may end with besides, e.g. "left"."""
+"""What any word may end with besides: "leftwards" is read as "left"."""
 NEIGHBORS = 3
 """How many known words an unknown one is a mixture of, at most."""
 CROWD = 100
@@ -133,18 +134,13 @@ lexicon = cache(Lexicon)
 @cache
 def function_words() -> frozenset[str]:
     """Return the words that are for grammar, and are never read as others."""
-    return frozenset(_file("function_words.txt").read_text("utf-8").split())
+    return frozenset((WORDS / "function_words.txt").read_text("utf-8").split())
 
 
 @cache
 def word_vectors() -> tuple[dict[str, int], np.ndarray]:
     """Return the rows of words, and their vectors of length 1 [C, E]."""
-    with _file("vectors.npy").open("rb") as file:
-        vectors = np.load(file).astype(np.float32)
-    words = _file("words.txt").read_text("utf-8").split()
+    vectors = np.load(WORDS / "vectors.npy").astype(np.float32)
+    words = (WORDS / "words.txt").read_text("utf-8").split()
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
     return {word: row for row, word in enumerate(words)}, vectors
-
-
-def _file(name: str) -> Path:
-    return Path(str(resources.files("ir_maniskill.assets") / "language" / name))

@@ -39,7 +39,7 @@ def tokenize(sentence: str, vocabulary: tuple[str, ...] = VOCABULARY) -> list[in
 @lru_cache(1000)
 def warn_of_unknown(sentence: str, vocabulary: tuple[str, ...]) -> None:
     """Log, once for each sentence, which of its words are read as `<unk>`."""
-    unknown = [word for word in split_words(sentence) if word not in vocabulary]
+    unknown = dict.fromkeys(w for w in split_words(sentence) if w not in vocabulary)
     if unknown:
         log.warning("%r: not in the vocabulary: %s", sentence, ", ".join(unknown))
 
