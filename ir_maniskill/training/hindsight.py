@@ -108,28 +108,34 @@ class Hindsight:
 
     # -- Sentences -------------------------------------------------------------------
 
-    def find(self, start: Snapshot, said: str, others: int) -> list[Instruction]:
+    def find(self, start: Snapshot, said: str | None, others: int) -> list[Instruction]:
         """Return instructions that are true of a scene [1]: what was said, and others.
 
-        Of a task that lists its sentences, there are at most as many as it has.
+        Of a task that lists its sentences, there are at most as many as it has; of one
+        that draws them there is none where nothing was said and nothing can be.
         """
-        own = self.said(said)
+        own = [] if said is None else [self.said(said)]
         if self.speaker is None:
-            listed = [each for each in self._listed if each != own]
+            listed = [each for each in self._listed if each not in own]
             order = torch.randperm(len(listed))[:others].tolist()
-            return [own, *(listed[i] for i in order)]
+            return [*own, *(listed[i] for i in order)]
         rng = Random(int(torch.randint(2**31, ())))
         (scene,) = things(start)
         drawn = (self.speaker.say(scene, rng) for _ in range(others))
-        return [own, *(each or own for each in drawn)]
+        found = own + [each for each in drawn if each is not None]
+        return (found * (others + 1))[: others + 1]
 
-    def choose(self, episode: Snapshot, said: str) -> tuple[list[Instruction], Judged]:
+    def choose(
+        self, episode: Snapshot, said: str | None
+    ) -> tuple[list[Instruction], Judged] | None:
         """Return the M instructions that most can be learned from, and their judgement.
 
         Of the others, half are those that the episode happened to fulfil, if there are
-        so many, and half are any.
+        so many, and half are any. None: nothing can be said.
         """
         found = self.find(episode.rows(torch.tensor([0])), said, SOUGHT * self.others)
+        if not found:
+            return None
         judged = self.judge(episode, found)
         lucky = _in_turns(found, judged.holds.any(dim=0))
         first = [0, *(i for i in lucky if i > 0)][: 1 + self.others // 2]

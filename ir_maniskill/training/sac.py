@@ -25,6 +25,7 @@ from ir_maniskill.agent.actor import Squashed, SquashedActor
 from ir_maniskill.agent.agent import Agent, StateSpec
 from ir_maniskill.agent.object_vision import LENGTH, ObjectVision
 from ir_maniskill.checks import require
+from ir_maniskill.environment.robots.robot import robot_class
 from ir_maniskill.environment.senses import State, read_text, stacked
 from ir_maniskill.snapshot import Snapshot
 from ir_maniskill.training import distributed
@@ -40,6 +41,7 @@ from ir_maniskill.training.config import SACConfig, TrainConfig
 from ir_maniskill.training.finite import check_finite
 from ir_maniskill.training.gradient import Loss, backward
 from ir_maniskill.training.hindsight import Hindsight, Pursuit, simulated
+from ir_maniskill.training.mirror import Mirror
 from ir_maniskill.training.replay import Replay
 from ir_maniskill.training.schedules import linear
 
@@ -140,6 +142,9 @@ class SAC(Algorithm):
         stacks = stacked(state)
         self._sensed = {name: name in stacks for name in self.agent.encoder.sensed}
         """What the policy senses, and whether it is stacked."""
+        robot, drawn = robot_class(config.robot), self.hindsight.speaker is not None
+        mirror = Mirror(robot) if robot.mirror and drawn else None
+        self.mirror = mirror if mirror and mirror.knows(self._sensed) else None
         read = self.agent.encoder.language.reads
         self._sentence = {name: state[name].shape[1] for name in read}
         self.pursuit = Pursuit(self.hindsight, len(state["instruction"]))
@@ -234,10 +239,19 @@ class SAC(Algorithm):
         self._past, self._began = self._past[oldest:], self._began - oldest
 
     def _keep(self, episode: State) -> None:
+        """Keep an episode, and what it looks like in a mirror if that is known."""
+        (said,) = read_text(episode.pop("text")[:1])
+        self._add(episode, said)
+        if self.mirror is not None:
+            self._add(self.mirror(episode), None)
+
+    def _add(self, episode: State, said: str | None) -> None:
         """Judge an episode under several sentences, and add it to the replay."""
         scenes = self._scene(episode["snapshot"])
-        (said,) = read_text(episode.pop("text")[:1])
-        found, judged = self.hindsight.choose(scenes, said)
+        chosen = self.hindsight.choose(scenes, said)
+        if chosen is None:
+            return
+        found, judged = chosen
         sentences = self.hindsight.read(found, self._sentence)
         rows, first = len(scenes.contact), not len(self.replay)
         self.replay.add(

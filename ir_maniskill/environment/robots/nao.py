@@ -49,6 +49,17 @@ FINGERTIPS = {
 }
 """The last link of each finger."""
 
+
+def _mirrored(part: str) -> tuple[str, float]:
+    """Return the joint or finger on the other side, and the sign of its angle there."""
+    side, name = "RL"["LR".index(part[0])], part[1:]
+    if name.startswith("Finger"):  # the first is the outer one left, the inner right
+        name = f"Finger{3 - int(name[6])}{name[7:]}"
+    return side + name, -1.0 if name.endswith(("Roll", "Yaw")) else 1.0
+
+
+MIRROR = {part: _mirrored(part) for part in (*JOINTS, *FINGERTIPS)}
+
 # -- Actuation -----------------------------------------------------------------------
 
 ARM = JointGroup(stiffness=20.0, damping=2.0, armature=1e-2, delta=0.2)
@@ -116,6 +127,7 @@ class Nao(Robot):
     hands = HANDS
     fingertips = FINGERTIPS
     postures = POSTURES
+    mirror = MIRROR
     shoulders = SHOULDERS
     reach = REACH
     solver_iterations = 4

@@ -84,6 +84,10 @@ class Robot(BaseAgent, ABC):
     """Where the arm of each hand starts in the world, seen from above (x, y) [m]."""
     reach: float
     """Farthest that an object may be from a shoulder, seen from above [m]."""
+    mirror: Mapping[str, tuple[str, float]] = {}
+    """If left and right are alike: of each joint and finger the one on the other side,
+    and the sign of its angle there. The learner `sac` then learns from what it did as
+    if it had been the other way round, too; cameras must stand in the middle."""
     start_qpos: Tensor
     """Start of every episode, in the simulator's order [J] [rad]."""
     jitter_unit: Tensor
