@@ -20,6 +20,7 @@ import gymnasium as gym
 import torch
 from mani_skill.utils.sapien_utils import look_at
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from PIL import Image, ImageDraw, ImageFont
 
 import ir_maniskill  # noqa: F401 - registers the tasks
@@ -152,16 +153,17 @@ def curves() -> Image.Image:
             axes.set(title=layout, xlabel=unit, ylim=(-3, 103))
             style_axes(axes, "y")
             for (preset, shape), style in CURVES.items():
-                path = RUNS / f"{preset}-NaoTouch{shape}{layout}-v1.csv"
-                rows = list(csv.DictReader(path.open())) if path.exists() else []
-                x, y = ([float(row[k]) for row in rows] for k in (unit, "exclusive"))
-                axes.plot(x, [100 * share for share in y], "o-", markersize=4, **style)
+                runs = f"{preset}-NaoTouch{shape}{layout}-v1*.csv"  # a file for a seed
+                for rows in (csv.DictReader(path.open()) for path in RUNS.glob(runs)):
+                    at = [(float(row[unit]), float(row["exclusive"])) for row in rows]
+                    x, y = zip(*at, strict=True)
+                    axes.plot(x, [100 * share for share in y], "o-", ms=3, **style)
             axes.set_xlim(left=0)
             if unit == "steps":
                 axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g} k")
     for axes in grid[:, 0]:
         axes.set_ylabel("exclusive success [%]")
-    lines = grid[0, 0].lines
+    lines = [Line2D([], [], marker="o", ms=3, **style) for style in CURVES.values()]
     figure.legend(handles=lines, loc="outside upper center", ncols=len(lines))
     figure.savefig(picture := io.BytesIO())
     return Image.open(picture).convert("RGB")
