@@ -25,12 +25,11 @@ from ir_maniskill.goals import (
     COLORS,
     FIXED,
     SHAPES,
-    Goal,
     GoalError,
     Instruction,
-    Push,
     Ref,
     Touch,
+    pushed,
 )
 from ir_maniskill.language import Thing
 from ir_maniskill.language import words as words_of_language
@@ -361,7 +360,7 @@ class Experiment:
                 fits,
                 "exactly one of: " + ", ".join(thing.name for thing in self.bodies),
             )
-        for ref in _pushed(instruction.goal):
+        for ref in pushed(instruction.goal):
             place = int(ref.resolve(layout)[0].int().argmax())
             thing, unknown = self.bodies[place], self.shuffled and ref.where is not None
             what = f"instruction {instruction.text!r}: what it pushes"
@@ -386,12 +385,6 @@ class Experiment:
                     f"{gap:.3f} m with jitter, expected at least "
                     f"{OBJECT_SIZE * math.sqrt(2):.3f} m"
                 )
-
-
-def _pushed(goal: Goal) -> list[Ref]:
-    """Return what a goal pushes."""
-    own = [goal.ref] if isinstance(goal, Push) else []
-    return own + [ref for part in goal.parts for ref in _pushed(part)]
 
 
 def touch_instructions(objects: Iterable[TouchObject]) -> tuple[Instruction, ...]:

@@ -327,9 +327,6 @@ class Push(Goal):
 
     def __post_init__(self) -> None:
         self._check(ref=Ref, distance=Real)
-        if self.ref.shape in FIXED:
-            got = f"got a {self.ref.shape}, which is fixed to the table"
-            raise GoalError(f"Push: {got}, expected what can move")
         _require_choice("direction of Push", self.direction, DIRECTIONS)
         if not 0 < self.distance <= 0.5:
             raise GoalError(f"distance of Push: got {self.distance}, expected 0 to 0.5")
@@ -356,6 +353,12 @@ class Push(Goal):
         return Measure(
             *(holds, gap, serves), level=progress, may_move=asked.ref, aim=behind
         )
+
+
+def pushed(goal: Goal) -> list[Ref]:
+    """Return what a goal pushes, also in its parts."""
+    own = [goal.ref] if isinstance(goal, Push) else []
+    return own + [ref for part in goal.parts for ref in pushed(part)]
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,6 @@ def test_a_reference_that_fits_none_or_two_is_refused_where_it_counts(ref):
         (lambda: Touch("blue cube"), "ref of Touch: got 'blue cube', expected a Ref"),
         (lambda: Push(RED, "up"), "direction of Push: got 'up', available: left"),
         (lambda: Push(RED, "left", -1.0), "distance of Push: got -1.0"),
-        (lambda: Push(Ref("red", "button"), "left"), "Push: got a button, .* fixed to"),
         (lambda: Both(Touch(RED), Then(Touch(RED), Touch(BLUE))), "a Then around it"),
         (lambda: Then(Then(Touch(RED), Touch(RED)), Touch(RED)), "expected it as `b`"),
     ],

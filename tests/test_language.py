@@ -8,6 +8,7 @@ from ir_maniskill.goals import (
     COLORS,
     DIRECTIONS,
     EXTREMES,
+    FIXED,
     RELATIONS,
     SHAPES,
     Avoid,
@@ -60,7 +61,10 @@ def any_act(rng):
     """Return a touch or a push."""
     if rng.random() < 0.5:
         return Touch(any_ref(rng), rng.choice([None, "left", "right"]))
-    return Push(any_ref(rng), rng.choice([*DIRECTIONS]))
+    ref = any_ref(rng)
+    while ref.shape in FIXED:
+        ref = any_ref(rng)
+    return Push(ref, rng.choice([*DIRECTIONS]))
 
 
 def any_goal(rng):
@@ -138,6 +142,7 @@ def test_sentences_read_as_people_read_them(sentence, goal):
         ("Push the red cube", "got the end, expected one of: away, closest"),
         ("Touch the red cube blue", "got 'blue' as word 5, .*, the end$"),
         ("", "got the end, expected one of: contact, could"),
+        ("Push the red button left.", "'Push .*': got a push of a button, which is"),
         ("please " * 300 + "touch it", "got 302 words, expected at most 100"),
     ],
 )
