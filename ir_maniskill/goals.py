@@ -26,6 +26,7 @@ from dataclasses import dataclass, field, fields
 from functools import partial
 from numbers import Real
 from types import SimpleNamespace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -244,6 +245,9 @@ class Measure(Lazy):
 class Goal(ABC):
     """What a sentence asks for. A subclass is a verb: its fields, and `measure`."""
 
+    MOVES: ClassVar[bool] = False
+    """Whether its references are to be moved, so must not be of a `FIXED` shape."""
+
     @staticmethod
     @abstractmethod
     def measure(scene: Snapshot, asked: SimpleNamespace) -> Measure:
@@ -267,6 +271,12 @@ class Goal(ABC):
         values = (getattr(self, f.name) for f in fields(self))
         own = tuple(value for value in values if isinstance(value, Ref))
         return own + tuple(ref for part in self.parts for ref in part.refs)
+
+    @property
+    def moved(self) -> tuple[Ref, ...]:
+        """References in it and its parts to what is to be moved."""
+        own = self.refs if self.MOVES else ()
+        return own + tuple(ref for part in self.parts for ref in part.moved)
 
     def _check(self, **kinds: type) -> None:
         for name, kind in kinds.items():
@@ -304,6 +314,8 @@ class Touch(Goal):
 @dataclass(frozen=True)
 class Push(Goal):
     """Push an object so far: "Push the red cube to the left."."""
+
+    MOVES = True
 
     ref: Ref
     """Which object."""
@@ -353,12 +365,6 @@ class Push(Goal):
         return Measure(
             *(holds, gap, serves), level=progress, may_move=asked.ref, aim=behind
         )
-
-
-def pushed(goal: Goal) -> list[Ref]:
-    """Return what a goal pushes, also in its parts."""
-    own = [goal.ref] if isinstance(goal, Push) else []
-    return own + [ref for part in goal.parts for ref in pushed(part)]
 
 
 @dataclass(frozen=True)

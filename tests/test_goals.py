@@ -53,6 +53,14 @@ def test_a_reference_fits_the_object_it_describes(ref, object_index):
     assert ref.resolve(scene())[0].nonzero().flatten().tolist() == [object_index]
 
 
+@pytest.mark.parametrize("ref", [Ref(shape="button"), GREEN, Ref(where="rightmost")])
+def test_what_is_fixed_to_the_table_is_not_to_be_moved(ref):
+    measured(Touch(ref), scene())
+    for goal in (Push(ref, "left"), Both(Push(ref, "left"), Touch(BLUE))):
+        with pytest.raises(GoalError, match="got a button to move in env 0, expected"):
+            measured(goal, scene())
+
+
 def test_a_reference_means_what_it_meant_when_the_episode_began():
     at = scene(moved=(0.0, 0.2, 0.0), which=2)  # now green is leftmost
     assert Ref(where="leftmost").resolve(at)[0].tolist() == [False, True, False]

@@ -102,6 +102,19 @@ def test_a_push_is_asked_where_the_hand_behind_the_thing_has_room() -> None:
 # -- Sentences -------------------------------------------------------------------------
 
 
+def test_what_is_told_to_be_pushed_is_free() -> None:
+    push = Instruction("Push that.", Push(Ref("purple"), "left"))
+    speaker = Speaker(instruct.ALL, layout_of(instruct.ALL, Nao))
+    streams = [np.random.RandomState(seed) for seed in range(20)]
+    slots, _, _ = speaker.draw(streams, [push] * len(streams))
+    there = [speaker.bodies[i] for i in slots.flatten() if i >= 0]
+    pushed = {body.shape for body in there if body.color == "purple"}
+    assert pushed == {"cube", "can", "pyramid"}
+    button = Instruction("Push it.", Push(Ref(shape="button"), "left"))
+    with pytest.raises(GoalError, match=r"got 'Push it\.', .* moves nothing fixed"):
+        speaker.draw(streams[:1], [button])
+
+
 @pytest.mark.parametrize("task", TASKS, ids=lambda task: task.id)
 @pytest.mark.parametrize("split", SPLITS)
 def test_sentences_are_of_their_split_and_true_of_their_scene(

@@ -20,6 +20,8 @@ from ir_maniskill.environment.senses import TEXT_BYTES, text_of, tokens_of
 from ir_maniskill.experiment import Experiment, Spoken
 from ir_maniskill.goals import (
     DIRECTIONS,
+    FIXED,
+    SHAPES,
     Goal,
     GoalError,
     Instruction,
@@ -146,7 +148,9 @@ class GoalTable:
             alike = [goal for goal in goals if type(goal) is kind]
             names = [field.name for field in fields(kind)]
             values = {name: [getattr(goal, name) for goal in alike] for name in names}
-            self._columns.append({n: _column(n, v, hands) for n, v in values.items()})
+            self._columns.append(
+                {n: _column(n, v, hands, kind.MOVES) for n, v in values.items()}
+            )
 
     def deal(
         self, index: Tensor, scene: Snapshot, counts: Tensor | None = None
@@ -156,7 +160,8 @@ class GoalTable:
         `counts` says which rows are asked at all [N] bool; None: all.
 
         Raises:
-            GoalError: A reference does not fit exactly one object.
+            GoalError: A reference does not fit exactly one object, or one that is to
+                be moved and is fixed.
         """
         kind, row = self._kind[index], self._row[index]  # [N]
         parts = []
@@ -172,11 +177,13 @@ class GoalTable:
         return GoalBatch(tuple(parts))
 
 
-def _column(name: str, values: list[Any], hands: Mapping[str, Tensor]) -> Deal:
+def _column(
+    name: str, values: list[Any], hands: Mapping[str, Tensor], moves: bool
+) -> Deal:
     """Return how the values of one field are dealt; see `goals` for the rules."""
     device = next(iter(hands.values())).device
     if all(isinstance(value, Ref) for value in values):
-        return _refs(values, device)
+        return _refs(values, device, moves)
     if all(isinstance(value, Goal) for value in values):
         table = GoalTable(values, hands, device)
         return lambda rows, counts, scene: table.deal(rows, scene, counts)
@@ -209,8 +216,9 @@ def _fingers(hand: str | None, hands: Mapping[str, Tensor]) -> Tensor:
     return hands[hand]
 
 
-def _refs(refs: list[Ref], device: torch.device) -> Deal:
+def _refs(refs: list[Ref], device: torch.device, moves: bool) -> Deal:
     """Return how references become masks [N, C]; each is looked up once."""
+    stays = torch.tensor([shape in FIXED for shape in SHAPES], device=device)
     distinct = list(dict.fromkeys(refs))
     which = torch.tensor([distinct.index(ref) for ref in refs], device=device)
 
@@ -227,6 +235,14 @@ def _refs(refs: list[Ref], device: torch.device) -> Deal:
             raise GoalError(
                 f"{distinct[int(used[env])]}: got {int(masks[env].sum())} objects that "
                 f"fit in env {env}, expected exactly one of its {there}"
+            )
+        fixed = masks & stays[scene.shape.clamp(min=0)] & counts[:, None] & moves
+        if fixed.any():
+            env, place = fixed.nonzero()[0].tolist()
+            shape = SHAPES[int(scene.shape[env, place])]
+            raise GoalError(
+                f"{distinct[int(used[env])]}: got a {shape} to move in env {env}, "
+                "expected what is not fixed to the table"
             )
         return masks
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from ir_maniskill.environment.layout import Free, Seats, hands_of
 from ir_maniskill.experiment import Experiment, Spoken, scene_of
-from ir_maniskill.goals import Goal, GoalError, Instruction, Ref
+from ir_maniskill.goals import FIXED, Goal, GoalError, Instruction, Ref
 from ir_maniskill.language import Thing, draw, handwritten, kind_of, say
 from ir_maniskill.language.splits import acts_of, refs_of, status
 from ir_maniskill.language.tokens import split_words
@@ -92,7 +92,7 @@ class Speaker:
         asked = self.spoken if wanted is None else repr(wanted.text)
         raise GoalError(
             f"instruction: got {asked}, expected what is true of one of {SCENES} "
-            "scenes and, if it is drawn, what the robot's hands can do there"
+            "scenes, moves nothing fixed and, if it is drawn, is in the hands' reach"
         )
 
     def _may_come_up(self, goal: Goal) -> bool:
@@ -155,8 +155,14 @@ class Speaker:
         return Instruction(sentence(goal, rng, spoken.split), goal)
 
     def is_true(self, goal: Goal, scene: Sequence[Thing]) -> bool:
-        """Return whether each of a goal's references fits one object of a scene."""
-        return all(resolve(ref, scene) is not None for ref in goal.refs)
+        """Return whether each of a goal's references fits one object of a scene.
+
+        What is to be moved must not be fixed.
+        """
+        found = {ref: resolve(ref, scene) for ref in goal.refs}
+        fixed = [i for i, thing in enumerate(scene) if thing.shape in FIXED]
+        moves_fixed = any(found[ref] in fixed for ref in goal.moved)
+        return None not in found.values() and not moves_fixed
 
     def can_ask(self, goal: Goal, scene: Sequence[Thing]) -> bool:
         """Return whether a goal that is true can be asked for in training's scenes."""

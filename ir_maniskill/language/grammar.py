@@ -19,7 +19,6 @@ from typing import Any
 from ir_maniskill.goals import (
     COLORS,
     EXTREMES,
-    FIXED,
     SHAPES,
     Avoid,
     Both,
@@ -30,7 +29,6 @@ from ir_maniskill.goals import (
     Relation,
     Then,
     Touch,
-    pushed,
 )
 from ir_maniskill.language.tokens import split_words, words_of
 
@@ -349,12 +347,7 @@ def parse(sentence: str, wording: bool = True) -> Goal:
     if len(goals) > 1:
         meanings = " or ".join(map(str, goals))
         raise SentenceError(f"sentence {sentence!r}: got {meanings}, expected one goal")
-    goal = goals.pop()
-    fixed = [ref.shape for ref in pushed(goal) if ref.shape in FIXED]
-    if fixed:
-        got = f"got a push of a {fixed[0]}, which is fixed to the table"
-        raise SentenceError(f"sentence {sentence!r}: {got}")
-    return goal
+    return goals.pop()
 
 
 def _complaint(reader: _Reader) -> str:
