@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from ir_maniskill.agent import Agent, StateSpec, language_system
-from ir_maniskill.agent.actor import Actor
+from ir_maniskill.agent.actor import Actor, SquashedActor
 from ir_maniskill.agent.alignment import FiLM
 from ir_maniskill.agent.critic import Standardize
 from ir_maniskill.agent.perceptual_system import PaperVision, PatchVision
@@ -145,10 +145,13 @@ def test_first_actions_are_near_the_middle_with_the_given_deviation():
     assert torch.allclose(policy.stddev, torch.tensor(0.36))
 
 
-def test_with_a_posture_gain_targets_go_to_the_posture_and_stay_there():
-    actor = Actor(10, (20,), ACTIONS, posture_gain=0.5)
+@pytest.mark.parametrize("kind", [Actor, SquashedActor])
+def test_with_a_posture_gain_targets_go_to_the_posture_and_stay_there(kind):
+    actor = kind(10, (20,), ACTIONS, posture_gain=0.5)
     posture = torch.linspace(-0.9, 0.9, ACTIONS)
-    actor.mean[-1].bias.data.copy_(posture)
+    last = actor.mean[-1] if kind is Actor else actor.layers[-1]
+    last.weight.data.zero_()
+    last.bias.data[:ACTIONS] = posture
     aligned, target = torch.zeros(8, 10), torch.rand(8, ACTIONS)
     target[0] = posture
     assert torch.allclose(actor(aligned, target).mean[0], torch.zeros(1), atol=1e-6)

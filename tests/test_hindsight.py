@@ -74,6 +74,22 @@ def test_critics_are_told_of_every_kind_of_goal_in_as_many_numbers() -> None:
     assert len(torch.unique(goal[0], dim=0)) == 4, "two goals look the same"
 
 
+@pytest.mark.parametrize("slots", [[2, 0, 1], [1, 2, 0]])
+def test_critics_need_not_know_in_which_slots_objects_lie(slots) -> None:
+    blue, red = Ref("blue"), Ref("red")
+    goals = told(Touch(blue), Push(red, "left"), Both(Touch(blue), Avoid(red)))
+    places = [(0.19, 0.0, 0.05), (0.23, 0.08, 0.05), (0.2, -0.1, 0.05)]
+    start = scene(places=places)
+    now = scene((0, 1), moved=(0.0, 0.01, 0.0), which=1, places=places)
+    seen = [sparse().judge(joined(start, now), goals).goal]
+    for each in (start, now):  # the same objects, at other indices
+        for name in ("pose", "start", "velocity", "color", "shape"):
+            vars(each)[name] = vars(each)[name][:, slots]
+        vars(each)["contact"] = each.contact[:, :, slots]
+    seen.append(sparse().judge(joined(start, now), goals).goal)
+    torch.testing.assert_close(*seen)
+
+
 def test_critics_and_the_acting_teacher_are_told_the_same_of_a_sequence() -> None:
     then = Then(Touch(Ref("red")), Touch(Ref("blue")))
     hindsight = sparse()

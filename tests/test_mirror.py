@@ -104,9 +104,16 @@ def test_a_sense_of_ones_own_has_no_mirror_image() -> None:
 
 
 @pytest.mark.parametrize(
-    ("task", "kept"), [("NaoInstructPush-v1", 2), ("NaoTouchCubeTriangle-v1", 1)]
+    ("task", "share", "kept"),
+    [
+        ("NaoInstructPush-v1", 0.0, 1),
+        ("NaoInstructPush-v1", 1.0, 2),
+        ("NaoTouchCubeTriangle-v1", 1.0, 1),
+    ],
 )
-def test_what_is_drawn_freely_is_kept_with_its_mirror_image(task, kept) -> None:
+def test_a_policy_learns_also_from_the_mirror_images_of_what_is_drawn_freely(
+    task, share, kept
+) -> None:
     listen = CONFIGS["listen"]
     small = dataclasses.replace(listen.sac, capacity=64)
     config = dataclasses.replace(listen, env_id=task, num_envs=1, sac=small)
@@ -116,6 +123,7 @@ def test_what_is_drawn_freely_is_kept_with_its_mirror_image(task, kept) -> None:
     with closing(GpuVectorEnv(task, 1, **backends, **kwargs)) as envs:
         state = StateStack(1).reset(envs.reset(seed=[0])[0])
     sac = SAC(config, state, 26)
+    sac.share = share
     for step in range(3):
         sac.act(state)
         done = torch.tensor([step == 2])

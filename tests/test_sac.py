@@ -172,7 +172,7 @@ def test_the_policy_learns_to_do_what_the_teacher_does(tmp_path) -> None:
     def off():
         with torch.no_grad():
             shown = algorithm._taught(algorithm._known(seen)).mean
-            done = algorithm.agent.actor(algorithm.agent.encoder(seen)).mean
+            done = algorithm.agent.policy(seen)
             return float((shown - done).square().mean())
 
     before, algorithm.share = off(), 0.5

@@ -26,12 +26,19 @@ def tanh_layers(
     return nn.Sequential(*layers[:-1])
 
 
+def drawn(posture: Tensor, target: Tensor, gain: float) -> Tensor:
+    """Return g (p - q) for a posture p and joint targets q; p itself without a gain.
+
+    As long as p stays, such changes of the targets bring them to p and hold them there,
+    whatever noise did to them before.
+    """
+    return gain * (posture - target) if gain > 0 else posture
+
+
 class Actor(nn.Module):
     """pi(a|s): a Gaussian whose mean is read from B_t, whose deviation is not.
 
-    With a `posture_gain` g the mean is g (p - q), where q are the joint targets and p
-    is what the layers give: as long as that stays, changes of the targets bring them
-    to the posture p and hold them there, whatever noise did to them before.
+    With a `posture_gain` the layers give a posture, to which the mean is `drawn`.
     """
 
     log_std: Tensor
@@ -50,9 +57,7 @@ class Actor(nn.Module):
 
         The joint targets [N, A] in [-1, 1] are unused without `posture_gain`.
         """
-        mean = self.mean(aligned)
-        if self.posture_gain > 0:
-            mean = self.posture_gain * (mean - target)
+        mean = drawn(self.mean(aligned), target, self.posture_gain)
         std = self.log_std.exp().expand_as(mean)
         return Normal(mean, std, validate_args=False)
 
@@ -92,17 +97,27 @@ def normed_layers(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequen
 
 
 class SquashedActor(nn.Module):
-    """pi(a|s): a Gaussian within [-1, 1] of which both parameters are read from B_t."""
+    """pi(a|s): a Gaussian within [-1, 1] of which both parameters are read from B_t.
+
+    With a `posture_gain` its center, before the tanh, is `drawn` to a posture.
+    """
 
     LOG_STD = (-4.0, 0.5)
     """Between which the logarithm of the deviation stays."""
 
-    def __init__(self, inputs: int, hidden: Sequence[int], actions: int) -> None:
+    def __init__(
+        self, inputs: int, hidden: Sequence[int], actions: int, posture_gain: float = 0
+    ) -> None:
         """Make the layers."""
         super().__init__()
+        self.posture_gain = posture_gain
         self.layers = normed_layers(inputs, hidden, 2 * actions)
 
-    def forward(self, aligned: Tensor) -> Squashed:
-        """Return the distribution of a_t [N, A], of B_t [N, D]."""
+    def forward(self, aligned: Tensor, target: Tensor) -> Squashed:
+        """Return the distribution of a_t [N, A], of B_t [N, D].
+
+        The joint targets [N, A] in [-1, 1] are unused without `posture_gain`.
+        """
         center, log_std = self.layers(aligned).float().chunk(2, dim=-1)
+        center = drawn(center, target, self.posture_gain)
         return Squashed(center, log_std.clamp(*self.LOG_STD))

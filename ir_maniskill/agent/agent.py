@@ -173,10 +173,8 @@ class Agent(nn.Module):
         self.encoder = StateEncoder(config, spec, config.senses)
         width, gain = self.encoder.width, config.posture_gain
         self.actor: Any  # an algorithm knows which of them it trains
-        if config.actor == "squashed":
-            self.actor = SquashedActor(width, config.hidden, spec.actions)
-        else:
-            self.actor = Actor(width, config.hidden, spec.actions, posture_gain=gain)
+        kind = SquashedActor if config.actor == "squashed" else Actor
+        self.actor = kind(width, config.hidden, spec.actions, posture_gain=gain)
         self.critic_encoder: StateEncoder | None = None
         self.critic: Critic | None = None
         self.locator: nn.Sequential | None = None
@@ -242,6 +240,4 @@ class Agent(nn.Module):
 
     def _distribution(self, state: State, aligned: Tensor) -> Any:
         """Return a `Normal`, or what is `Squashed`."""
-        if isinstance(self.actor, SquashedActor):
-            return self.actor(aligned)
         return self.actor(aligned, state["target"][:, 0])

@@ -212,8 +212,6 @@ class TrainConfig:
         senses, start = self.agent.senses, self.sac.random_steps
         fits = "state" not in (senses or ())
         require(fits, "senses", senses, "no 'state', which tells one sentence's")
-        gain = self.agent.posture_gain
-        require(gain == 0, "posture_gain", gain, "0 with 'sac'")
         least = math.floor(start / self.sac.policy_from) + 1
         expected = f"at least {least}: the teacher learns from {start} "
         expected += f"(sac.random_steps) on, in {self.sac.policy_from:g} of the steps"
@@ -275,6 +273,7 @@ CONFIGS: dict[str, TrainConfig] = {
             language="lexicon",
             vision="objects",
             actor="squashed",
+            posture_gain=2.0,
             critic="none",
             language_length=40,
             auxiliary_weight=2.0,

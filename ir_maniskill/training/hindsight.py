@@ -12,10 +12,12 @@ import itertools
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from random import Random
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.agent.object_vision import LENGTH
@@ -303,20 +305,31 @@ class Pursuit:
 def describe(
     scene: Snapshot, measure: Measure, verdict: Verdict, fouled: Tensor
 ) -> Tensor:
-    """Return what a goal asks, and how far it is, as numbers [N, D].
+    """Return a scene, what a goal asks of it, and how far it is, as numbers [N, D].
 
     They come from its measure alone, so they serve for any kind of goal.
     """
-    serves, there = measure.serves, (scene.color >= 0)[:, None]  # [N, F, C]
+    serves, there = measure.serves, scene.color >= 0  # [N, F, C], [N, C]
     way = _nearest(measure.aim[:, None] - scene.to_object, serves)
-    threat = _nearest(-scene.to_object, reward_generator.forbidden(measure) & there)
+    threat = _nearest(
+        -scene.to_object, reward_generator.forbidden(measure) & there[:, None]
+    )
+    order = _order(scene, measure)
+    ours = partial(_in_order, order)
+    kinds = functional.one_hot(scene.shape.clamp(min=0), len(SHAPES)) * there[..., None]
     flags = (
-        *(serves, measure.bars.any(dim=1), measure.may_move, measure.still),
-        *(verdict.right, verdict.wrong, verdict.disturbed, measure.holds, fouled),
+        *(ours(serves, dim=2), ours(scene.contact, dim=2)),
+        *map(ours, (measure.bars.any(dim=1), measure.may_move, measure.still, there)),
+        *(ours(kinds), verdict.right, verdict.wrong, verdict.disturbed),
+        *(measure.holds, fouled),
     )
     places = (scene.position, scene.moved, measure.aim)
     middle, moved, aim = (_middle(place, measure) for place in places)
-    lengths = (way, threat, middle, 2 * moved, 2 * aim)
+    lengths = (
+        *(scene.fingertip, way, threat, middle, 2 * moved, 2 * aim),
+        *map(ours, (scene.position * there[..., None], 2 * scene.moved)),
+        ours(scene.velocity),
+    )
     numbers = (measure.level, measure.gap / LENGTH, measure.stage)
     columns = [
         *(flag.flatten(1) if flag.ndim > 1 else flag[:, None] for flag in flags),
@@ -324,6 +337,24 @@ def describe(
         *(number[:, None] for number in numbers),
     ]
     return torch.cat([column.float() for column in columns], dim=1).clamp(-10, 10)
+
+
+def _order(scene: Snapshot, measure: Measure) -> Tensor:
+    """Return the objects as critics read them, whatever slots they lie in [N, C].
+
+    First comes what a goal asks about, from right to left, then the nearest to that.
+    """
+    asked, y = measure.serves.any(dim=1), scene.start[..., 1]  # [N, C]
+    off = scene.start[..., :3] - _middle(scene.start[..., :3], measure)[:, None]
+    rank = torch.where(asked, y, 10 + off.norm(dim=2))
+    return rank.masked_fill(scene.color < 0, torch.inf).argsort(dim=1)
+
+
+def _in_order(order: Tensor, values: Tensor, dim: int = 1) -> Tensor:
+    """Return what is known of each object along `dim`, in an order [N, C]."""
+    shape = [1] * values.ndim
+    shape[0], shape[dim] = order.shape
+    return values.gather(dim, order.view(shape).expand_as(values))
 
 
 def _nearest(ways: Tensor, which: Tensor) -> Tensor:
@@ -334,15 +365,3 @@ def _nearest(ways: Tensor, which: Tensor) -> Tensor:
     near = ways.norm(dim=3).where(which, torch.inf).argmin(dim=2)[..., None, None]
     shortest = ways.gather(2, near.expand(-1, -1, 1, 3)).squeeze(2)
     return shortest * which.any(dim=2, keepdim=True)
-
-
-def simulated(scene: Snapshot) -> Tensor:
-    """Return a scene as numbers, whatever is asked in it [N, D]."""
-    there = (scene.color >= 0).float()  # [N, C]
-    kinds = torch.nn.functional.one_hot(scene.shape.clamp(min=0), len(SHAPES))
-    columns = (
-        *(scene.contact.float(), scene.fingertip / LENGTH, there),
-        *(kinds * there[..., None], scene.position * there[..., None] / LENGTH),
-        *(2 * scene.moved / LENGTH, scene.velocity / LENGTH),
-    )
-    return torch.cat([c.flatten(1) for c in columns], dim=1).clamp(-10, 10)

@@ -40,7 +40,7 @@ from ir_maniskill.training.algorithm import (
 from ir_maniskill.training.config import SACConfig, TrainConfig
 from ir_maniskill.training.finite import check_finite
 from ir_maniskill.training.gradient import Loss, backward
-from ir_maniskill.training.hindsight import Hindsight, Pursuit, simulated
+from ir_maniskill.training.hindsight import Hindsight, Pursuit
 from ir_maniskill.training.mirror import Mirror
 from ir_maniskill.training.replay import Replay
 from ir_maniskill.training.schedules import linear
@@ -135,7 +135,7 @@ class SAC(Algorithm):
         expected = f"at least {rows}: episodes that a checkpoint cuts short are lost"
         every = config.checkpoint_interval
         require(every >= rows, "checkpoint_interval", every, expected)
-        self.frames = config.frames
+        self.frames, self.actions = config.frames, actions
         self._threads = config.threads or distributed.cores()
         self.agent = Agent(config.agent, StateSpec.of(state, actions))
         self.agent.to(state["instruction"].device)
@@ -149,7 +149,8 @@ class SAC(Algorithm):
         self._sentence = {name: state[name].shape[1] for name in read}
         self.pursuit = Pursuit(self.hindsight, len(state["instruction"]))
         inputs = self._known(self._simulated(state)).shape[1]
-        self.teacher = SquashedActor(inputs, WIDTHS, actions)
+        gain = config.agent.posture_gain
+        self.teacher = SquashedActor(inputs, WIDTHS, actions, posture_gain=gain)
         self.critics = Critics(inputs + actions)
         self.slow = copy.deepcopy(self.critics).requires_grad_(False)
         self.log_temperature = torch.tensor(math.log(TEMPERATURE), requires_grad=True)
@@ -161,7 +162,7 @@ class SAC(Algorithm):
             "temperature": adam([self.log_temperature], TEMPERATURE_RATE),
         }
         self.replay = Replay(config.sac.capacity)
-        self.actions, self.updates = actions, 0
+        self.updates = 0
         self._history: dict[str, list[Tensor]] = defaultdict(list)
         self._past: list[State] = []
         """Steps of all envs whose episodes go on, the oldest first."""
@@ -196,17 +197,16 @@ class SAC(Algorithm):
         return action
 
     def _taught(self, known: Tensor) -> Squashed:
-        """Return what the teacher would do [N, A]."""
+        """Return what the teacher would do [N, A], of what it reads [N, D]."""
         with in_16_bits():
-            return self.teacher(known)
+            return self.teacher(known, known[:, : self.actions])
 
     def _simulated(self, state: State) -> State:
         """Return what critics read of a state, before it is put together."""
         scene = self._scene(state["snapshot"])
         goal = self.pursuit.look(scene, state["text"])
         now = {f"now.{k}": state[k][:, 0] for k in ("proprioception", "target")}
-        kept = {name: state[name] for name in ("joint_velocity", "snapshot")}
-        return now | kept | {"goal": goal}
+        return now | {"joint_velocity": state["joint_velocity"], "goal": goal}
 
     def _kept(self, state: State) -> State:
         """Return what of a state is kept: of stacks the newest alone."""
@@ -239,10 +239,10 @@ class SAC(Algorithm):
         self._past, self._began = self._past[oldest:], self._began - oldest
 
     def _keep(self, episode: State) -> None:
-        """Keep an episode, and what it looks like in a mirror if that is known."""
+        """Keep an episode, for a policy also as a mirror shows it, if that is known."""
         (said,) = read_text(episode.pop("text")[:1])
         self._add(episode, said)
-        if self.mirror is not None:
+        if self.mirror is not None and self._schooling > 0:
             self._add(self.mirror(episode), None)
 
     def _add(self, episode: State, said: str | None) -> None:
@@ -315,8 +315,9 @@ class SAC(Algorithm):
         seen |= {k: replay.read(k, rows, column=which) for k in self._sentence}
         if "instruction" in seen:
             seen["instruction"] = seen["instruction"].long()
-        named = replay.read("named", rows, column=which)
-        return seen | self._read(rows, which) | {"named": named}
+        truth = {"named": replay.read("named", rows, column=which)}
+        truth["snapshot"] = replay.read("snapshot", rows)
+        return seen | self._read(rows, which) | truth
 
     def _rows(self) -> tuple[Tensor, Tensor]:
         """Return rows [B], and under which of its sentences to see each [B]."""
@@ -327,20 +328,17 @@ class SAC(Algorithm):
         """Return what critics read of some rows, before it is put together."""
         replay = self.replay
         now = {f"now.{k}": replay.read(k, rows) for k in ("proprioception", "target")}
-        kept = {
-            name: replay.read(name, rows) for name in ("joint_velocity", "snapshot")
-        }
-        return now | kept | {"goal": replay.read("goal", rows, column=which).float()}
+        now["joint_velocity"] = replay.read("joint_velocity", rows)
+        return now | {"goal": replay.read("goal", rows, column=which).float()}
 
     def _scene(self, rows: Tensor) -> Snapshot:
         return Snapshot.unpack(rows, self.hindsight.fingers)
 
     def _known(self, read: State) -> Tensor:
-        """Return what critics and teacher read [B, D]."""
-        scene = simulated(self._scene(read["snapshot"]))
+        """Return what critics and teacher read [B, D], the joint targets first."""
         speed = (read["joint_velocity"] / 10).clamp(-1, 1)
-        felt = read["now.proprioception"], read["now.target"]
-        return torch.cat([*felt, speed, scene, read["goal"]], dim=1)
+        felt = read["now.target"], read["now.proprioception"]
+        return torch.cat([*felt, speed, read["goal"]], dim=1)
 
     def _teach(self) -> None:
         """Improve critics and teacher by a step of all envs."""
@@ -403,7 +401,7 @@ class SAC(Algorithm):
         encoder, scene = self.agent.encoder, self._scene(now["snapshot"])
         with in_16_bits():
             aligned = encoder(now)
-            mean = self.agent.actor(aligned).mean
+            mean = self.agent.actor(aligned, now["now.target"]).mean
         loss = functional.mse_loss(mean, shown)
         means = {"imitation": loss}
         if isinstance(encoder.vision, ObjectVision):
