@@ -1,6 +1,7 @@
 """Free scenes and spoken sentences: what holds for all ids and splits."""
 
 from collections.abc import Iterator
+from itertools import compress
 
 import gymnasium as gym
 import numpy as np
@@ -13,7 +14,13 @@ from ir_maniskill.environment.arguments import instructions_of
 from ir_maniskill.environment.layout import layout_of
 from ir_maniskill.environment.robots import Nao, Panda
 from ir_maniskill.environment.speaker import Speaker, resolve
-from ir_maniskill.experiment import Drawn, Experiment, ExperimentError, Spoken
+from ir_maniskill.experiment import (
+    Drawn,
+    Experiment,
+    ExperimentError,
+    Spoken,
+    scene_of,
+)
 from ir_maniskill.goals import (
     COLORS,
     SHAPES,
@@ -22,6 +29,7 @@ from ir_maniskill.goals import (
     Push,
     Ref,
     Touch,
+    left_of,
 )
 from ir_maniskill.language import (
     HELD_OBJECTS,
@@ -33,7 +41,7 @@ from ir_maniskill.language import (
     parse,
     split_of,
 )
-from ir_maniskill.language.splits import acts_of
+from ir_maniskill.language.splits import acts_of, refs_of
 from ir_maniskill.language.tokens import split_words
 from ir_maniskill.tasks import instruct
 
@@ -102,6 +110,17 @@ def test_a_push_is_asked_where_the_hand_behind_the_thing_has_room() -> None:
 # -- Sentences -------------------------------------------------------------------------
 
 
+def test_what_training_holds_out_is_not_named_beside_either() -> None:
+    speaker = Speaker(instruct.ALL, layout_of(instruct.ALL, Nao))
+    new, known = sorted(HELD_OBJECTS)[0], ("green", "can")
+    assert known not in HELD_OBJECTS
+    for beside, asked in ((known, True), (new, False)):
+        scene = Thing("red", "can", 0.19, 0.08), Thing(*beside, 0.19, -0.08)
+        goal = Touch(Ref(where=left_of(Ref(*beside))))
+        assert speaker.is_true(goal, scene)
+        assert speaker.can_ask(goal, scene) == asked
+
+
 def test_what_is_told_to_be_pushed_is_free() -> None:
     push = Instruction("Push that.", Push(Ref("purple"), "left"))
     speaker = Speaker(instruct.ALL, layout_of(instruct.ALL, Nao))
@@ -131,12 +150,13 @@ def test_sentences_are_of_their_split_and_true_of_their_scene(
         assert split_of(said.goal) == new
         if split != "objects":
             acts = [(verb, resolve(ref, scene)) for verb, ref in acts_of(said.goal)]
-            meant = [index for _, index in acts]
-            kinds = [(scene[i].color, scene[i].shape) for i in meant]
-            assert not set(kinds) & HELD_OBJECTS
+            fits = [ref.resolve(scene_of(scene))[0] for ref in refs_of(said.goal)]
+            named = [thing for each in fits for thing in compress(scene, each)]
+            assert not {thing[:2] for thing in named} & HELD_OBJECTS
             pairs = {(verb, scene[i].color) for verb, i in acts}
             assert bool(pairs & HELD_PAIRS) == (split == "pairs")
-            held = [task.objects.is_held_out(scene[i].x, scene[i].y) for i in meant]
+            places = [(scene[i].x, scene[i].y) for _, i in acts]
+            held = [task.objects.is_held_out(*place) for place in places]
             # Two hands need things farther apart than the strip is wide.
             some = any if kind_of(said.goal) == "both" else all
             assert some(held) if split == "places" else not any(held)

@@ -15,7 +15,7 @@ from ir_maniskill.environment.layout import Free, Seats, hands_of
 from ir_maniskill.experiment import Experiment, Spoken, scene_of
 from ir_maniskill.goals import FIXED, Goal, GoalError, Instruction, Ref
 from ir_maniskill.language import Thing, draw, handwritten, kind_of, say
-from ir_maniskill.language.splits import acts_of, refs_of, status
+from ir_maniskill.language.splits import HELD_OBJECTS, acts_of, refs_of, status
 from ir_maniskill.language.tokens import split_words
 
 SCENES = 5000
@@ -166,16 +166,15 @@ class Speaker:
 
     def can_ask(self, goal: Goal, scene: Sequence[Thing]) -> bool:
         """Return whether a goal that is true can be asked for in training's scenes."""
-        allows, acts = self.layout.allows(scene), []
-        for verb, ref in acts_of(goal):
-            index = resolve(ref, scene)
-            assert index is not None
-            color, shape, *_ = scene[index]
-            if status(verb, color, shape) != "train":
-                return False
-            acts.append((verb, index))
+        allows = self.layout.allows(scene)
+        acts = [(verb, i) for verb, ref in acts_of(goal) for i in _fits(ref, scene)]
+        named = [i for ref in refs_of(goal) for i in _fits(ref, scene)]
+        known = all(
+            scene[i][:2] not in HELD_OBJECTS and allows([("name", i)]) for i in named
+        )
+        known &= all(status(verb, *scene[i][:2]) == "train" for verb, i in acts)
         together = [acts] if kind_of(goal) == "both" else [[act] for act in acts]
-        return all(map(allows, together))
+        return known and all(map(allows, together))
 
 
 def _rng(stream: np.random.RandomState) -> Random:
@@ -184,8 +183,13 @@ def _rng(stream: np.random.RandomState) -> Random:
 
 def resolve(ref: Ref, scene: Sequence[Thing]) -> int | None:
     """Return which object of a scene a reference fits; None: none, or several."""
-    fits = ref.resolve(scene_of(scene))[0].nonzero().flatten().tolist()
+    fits = _fits(ref, scene)
     return fits[0] if len(fits) == 1 else None
+
+
+def _fits(ref: Ref, scene: Sequence[Thing]) -> list[int]:
+    found: list[int] = ref.resolve(scene_of(scene))[0].nonzero().flatten().tolist()
+    return found
 
 
 def sentence(goal: Goal, rng: Random, split: str) -> str:
