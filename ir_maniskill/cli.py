@@ -140,6 +140,9 @@ class Evaluate(_Play):
 
     instruction: str | None = None
     """Play this sentence only; None: all of the task's."""
+    split: str = "train"
+    """What is new in the sentences, if they are spoken: train (nothing), wording,
+    objects, pairs or places."""
     episodes: int = 100
     """Episodes, spread evenly over the instructions."""
     num_envs: int = 8
@@ -157,8 +160,9 @@ class Evaluate(_Play):
         if self.json is not None:
             require_writable(self.json)
         task = catalog.get(self.env_id).id
-        more = ("instruction", "episodes", "num_envs", "sim_backend", "render_backend")
-        report = api.evaluate(policy, task, **self.options(*more))
+        more = ("instruction", "split", "episodes", "num_envs")
+        backends = ("sim_backend", "render_backend")
+        report = api.evaluate(policy, task, **self.options(*more, *backends))
         print(report)
         if self.json is not None:
             write_report(
