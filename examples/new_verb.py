@@ -20,7 +20,7 @@ from ir_maniskill.snapshot import Snapshot
 class Spin(Goal):
     """Turn an object about the vertical by so many radians, either way."""
 
-    MOVES = True  # what is fixed to the table cannot be turned
+    MOVES = ("ref",)  # what is fixed to the table cannot be turned
 
     ref: Ref
     angle: float = 0.8

@@ -168,6 +168,7 @@ class Evaluate(_Play):
             write_report(
                 self.json,
                 report,
+                split=self.split,
                 reward_mode=policy.env_kwargs["reward_mode"],
                 checkpoint=str(self.checkpoint or task),
                 trained_steps=policy.metadata.get("steps"),

@@ -23,6 +23,8 @@ import torch
 from ir_maniskill import checks
 from ir_maniskill.goals import (
     COLORS,
+    FIXED,
+    MOVABLE,
     SHAPES,
     GoalError,
     Instruction,
@@ -349,15 +351,19 @@ class Experiment:
     def _check_refs(self, instruction: Instruction) -> None:
         """Raise unless each reference fits one object, as far as the layout says."""
         layout = scene_of(Thing(o.color, o.shape, *o.position) for o in self.bodies)
-        for ref in instruction.goal.refs:
-            fits = int(ref.resolve(layout).sum())
-            unknown = self.shuffled and ref.where is not None  # told at each reset
+        what, goal = f"instruction {instruction.text!r}", instruction.goal
+        for ref in goal.refs:
+            if self.shuffled and ref.where is not None:
+                continue  # what fits is told at each reset
+            fits = list(itertools.compress(self.bodies, ref.resolve(layout)[0]))
             _require(
-                fits == 1 or unknown,
-                f"instruction {instruction.text!r}: objects that {ref} fits",
-                fits,
+                len(fits) == 1,
+                f"{what}: objects that {ref} fits",
+                len(fits),
                 "exactly one of: " + ", ".join(thing.name for thing in self.bodies),
             )
+            free = ref not in goal.moved or fits[0].shape not in FIXED
+            _require(free, f"{what}: what it moves", fits[0].name, MOVABLE)
 
     def _check_layout(self, objects: tuple[TouchObject, ...]) -> None:
         slack = self.jitter.position * math.sqrt(2)

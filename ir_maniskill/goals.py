@@ -68,6 +68,9 @@ EXTREMES = {
 RELATIONS = ("left_of", "right_of", "other_than")
 """Relations to another object."""
 
+MOVABLE = "what is not fixed to the table"
+"""What errors expect where something else is to be moved."""
+
 MOVED = 0.02
 """From which distance on an object counts as moved [m]."""
 
@@ -245,8 +248,8 @@ class Measure(Lazy):
 class Goal(ABC):
     """What a sentence asks for. A subclass is a verb: its fields, and `measure`."""
 
-    MOVES: ClassVar[bool] = False
-    """Whether its references are to be moved, so must not be of a `FIXED` shape."""
+    MOVES: ClassVar[tuple[str, ...]] = ()
+    """Fields whose references are to be moved, so must not be of a `FIXED` shape."""
 
     @staticmethod
     @abstractmethod
@@ -275,7 +278,7 @@ class Goal(ABC):
     @property
     def moved(self) -> tuple[Ref, ...]:
         """References in it and its parts to what is to be moved."""
-        own = self.refs if self.MOVES else ()
+        own = tuple(getattr(self, name) for name in self.MOVES)
         return own + tuple(ref for part in self.parts for ref in part.moved)
 
     def _check(self, **kinds: type) -> None:
@@ -315,7 +318,7 @@ class Touch(Goal):
 class Push(Goal):
     """Push an object so far: "Push the red cube to the left."."""
 
-    MOVES = True
+    MOVES = ("ref",)
 
     ref: Ref
     """Which object."""
@@ -476,3 +479,7 @@ class Instruction:
     def __post_init__(self) -> None:
         _require_type("instruction text", self.text, str)
         _require_type("instruction goal", self.goal, Goal)
+        for ref in self.goal.moved:
+            if ref.shape in FIXED:
+                got = f"got a {ref.shape} to move, expected {MOVABLE}"
+                raise GoalError(f"instruction {self.text!r}: {got}")

@@ -160,6 +160,16 @@ def test_with_a_posture_gain_targets_go_to_the_posture_and_stay_there(kind):
     assert torch.allclose(target, posture.expand(8, -1), atol=1e-3)
 
 
+@pytest.mark.parametrize("actor", ["gaussian", "squashed"])
+def test_joint_targets_are_needed_only_to_be_drawn_to_a_posture(actor):
+    state, senses = make_state(), ("touch", "proprioception")
+    known = {name: value for name, value in state.items() if name != "target"}
+    make_agent(state, senses=senses, actor=actor).policy(known)
+    drawn = make_agent(state, senses=senses, actor=actor, posture_gain=1.0)
+    with pytest.raises(ValueError, match="target of the state: got nothing, but"):
+        drawn.policy(known)
+
+
 def test_the_newest_joint_targets_are_what_the_posture_is_compared_with():
     state = make_state()
     agent = make_agent(state, posture_gain=2.0, senses=("touch", "proprioception"))

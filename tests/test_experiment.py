@@ -23,8 +23,10 @@ from ir_maniskill.experiment import (
     touch_instructions,
 )
 from ir_maniskill.goals import (
+    Both,
     GoalError,
     Instruction,
+    Push,
     Ref,
     Touch,
     left_of,
@@ -190,3 +192,11 @@ def test_a_relation_in_shuffled_places_is_left_to_the_reset() -> None:
     with pytest.raises(ExperimentError, match="fits: got 2, expected exactly"):
         make(objects=(BLUE, RED, green), instructions=(two,))
     make(objects=(BLUE, RED, green), instructions=(two,), shuffled=True)
+
+
+def test_what_is_fixed_to_the_table_is_not_to_be_pushed() -> None:
+    button = TouchObject("green", (0.20, -0.10), shape="button")
+    push = Push(Ref("green"), "left")
+    both = Instruction("Push green left, touch blue.", Both(push, Touch(Ref("blue"))))
+    with pytest.raises(ExperimentError, match="it moves: got 'green button', expected"):
+        make(objects=(BLUE, button), instructions=(both,))

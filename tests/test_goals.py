@@ -10,7 +10,7 @@ import torch
 from scenes import HANDS, scene
 
 import ir_maniskill
-from ir_maniskill import Avoid, Both, Push, Ref, Then, Touch
+from ir_maniskill import Avoid, Both, Instruction, Push, Ref, Then, Touch
 from ir_maniskill.environment.instructional_set import GoalTable
 from ir_maniskill.environment.reward_generator import judge
 from ir_maniskill.goals import GoalError, left_of, other_than, right_of
@@ -59,6 +59,21 @@ def test_what_is_fixed_to_the_table_is_not_to_be_moved(ref):
     for goal in (Push(ref, "left"), Both(Push(ref, "left"), Touch(BLUE))):
         with pytest.raises(GoalError, match="got a button to move in env 0, expected"):
             measured(goal, scene())
+
+
+def test_a_verb_says_which_of_its_references_are_to_be_moved():
+    @dataclasses.dataclass(frozen=True)
+    class Carry(Touch):
+        MOVES = ("ref",)
+        to: Ref = GREEN
+        after: Touch = dataclasses.field(default_factory=lambda: Touch(GREEN))
+
+    assert Both(Carry(RED), Touch(BLUE)).moved == (RED,)
+    measured(Carry(RED), scene())
+    with pytest.raises(GoalError, match="got a button to move in env 0, expected"):
+        measured(Carry(GREEN), scene())
+    with pytest.raises(GoalError, match="'Carry it.': got a button to move, expected"):
+        Instruction("Carry it.", Carry(Ref(shape="button")))
 
 
 def test_a_reference_means_what_it_meant_when_the_episode_began():

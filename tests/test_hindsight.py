@@ -5,14 +5,16 @@ import dataclasses
 import gymnasium as gym
 import pytest
 import torch
+from scenes import HANDS as FINGERS
 from scenes import scene
 
 from ir_maniskill import experiment as catalog
+from ir_maniskill.environment.instructional_set import GoalTable
 from ir_maniskill.environment.senses import read_text, text_of
 from ir_maniskill.goals import Avoid, Both, Instruction, Push, Ref, Then, Touch
 from ir_maniskill.snapshot import Snapshot
 from ir_maniskill.training.config import CONFIGS
-from ir_maniskill.training.hindsight import Hindsight, Pursuit, _in_turns
+from ir_maniskill.training.hindsight import Hindsight, Pursuit, _in_turns, _order
 
 HANDS = {"left": ("a", "b", "c"), "right": ("d", "e", "f")}
 LISTEN = CONFIGS["listen"]
@@ -75,12 +77,16 @@ def test_critics_are_told_of_every_kind_of_goal_in_as_many_numbers() -> None:
 
 
 @pytest.mark.parametrize("slots", [[2, 0, 1], [1, 2, 0]])
-def test_critics_need_not_know_in_which_slots_objects_lie(slots) -> None:
+@pytest.mark.parametrize("there", [True, False])
+def test_critics_need_not_know_in_which_slots_objects_lie(slots, there) -> None:
     blue, red = Ref("blue"), Ref("red")
     goals = told(Touch(blue), Push(red, "left"), Both(Touch(blue), Avoid(red)))
     places = [(0.19, 0.0, 0.05), (0.23, 0.08, 0.05), (0.2, -0.1, 0.05)]
     start = scene(places=places)
     now = scene((0, 1), moved=(0.0, 0.01, 0.0), which=1, places=places)
+    now.velocity[:] = torch.tensor([[0.1], [0.2], [0.3]])
+    if not there:
+        start.color[:, 2] = now.color[:, 2] = -1
     seen = [sparse().judge(joined(start, now), goals).goal]
     for each in (start, now):  # the same objects, at other indices
         for name in ("pose", "start", "velocity", "color", "shape"):
@@ -88,6 +94,24 @@ def test_critics_need_not_know_in_which_slots_objects_lie(slots) -> None:
         vars(each)["contact"] = each.contact[:, :, slots]
     seen.append(sparse().judge(joined(start, now), goals).goal)
     torch.testing.assert_close(*seen)
+
+
+@pytest.mark.parametrize(
+    ("goal", "order"),
+    [
+        (Touch(Ref("red")), [1, 0, 2]),  # red, then blue, which is nearer than green
+        (Touch(Ref("green")), [2, 0, 1]),
+        (Both(Touch(Ref("red")), Touch(Ref("green"))), [2, 1, 0]),  # right to left
+        (Avoid(Ref("green")), [0, 2, 1]),  # it asks about none
+    ],
+)
+def test_what_is_asked_about_comes_first_then_what_is_near(goal, order) -> None:
+    at = scene(places=[(0.19, 0.0, 0.05), (0.23, 0.08, 0.05), (0.2, -0.1, 0.05)])
+    one = torch.zeros(1, dtype=torch.int64)
+    measure = GoalTable([goal], FINGERS, torch.device("cpu")).deal(one, at).measure(at)
+    assert _order(at, measure).tolist() == [order]
+    at.color[:, 0] = -1
+    assert _order(at, measure).tolist() == [[*(i for i in order if i), 0]]
 
 
 def test_critics_and_the_acting_teacher_are_told_the_same_of_a_sequence() -> None:

@@ -165,13 +165,27 @@ def test_the_teacher_learns_first_and_then_stays_as_it_is(tmp_path) -> None:
     assert changed(1.1 * begun) == [True, False, False]
 
 
+def test_the_teacher_draws_the_joint_targets_to_a_posture(tmp_path) -> None:
+    agent = dataclasses.replace(toy_sac(tmp_path).agent, posture_gain=2.0)
+    algorithm = collected(tmp_path, ToyVectorEnv(snapshots=True), agent=agent)
+    posture, last = torch.tensor([0.3, -0.5]), algorithm.teacher.layers[-1]
+    with torch.no_grad():
+        last.weight.zero_()
+        last.bias[:2] = posture
+    seen = algorithm._seen(*algorithm._rows())
+    seen["now.target"] = target = torch.rand_like(seen["now.target"])
+    expected = torch.tanh(2 * (posture - target))
+    done = algorithm._taught(seen).mean
+    torch.testing.assert_close(done, expected, atol=0.01, rtol=0)
+
+
 def test_the_policy_learns_to_do_what_the_teacher_does(tmp_path) -> None:
     algorithm = collected(tmp_path, ToyVectorEnv(snapshots=True))
     seen = algorithm._seen(*algorithm._rows())
 
     def off():
         with torch.no_grad():
-            shown = algorithm._taught(algorithm._known(seen)).mean
+            shown = algorithm._taught(seen).mean
             done = algorithm.agent.policy(seen)
             return float((shown - done).square().mean())
 

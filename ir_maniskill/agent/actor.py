@@ -26,13 +26,16 @@ def tanh_layers(
     return nn.Sequential(*layers[:-1])
 
 
-def drawn(posture: Tensor, target: Tensor, gain: float) -> Tensor:
+def drawn(posture: Tensor, target: Tensor | None, gain: float) -> Tensor:
     """Return g (p - q) for a posture p and joint targets q; p itself without a gain.
 
     As long as p stays, such changes of the targets bring them to p and hold them there,
     whatever noise did to them before.
     """
-    return gain * (posture - target) if gain > 0 else posture
+    if gain == 0:
+        return posture
+    assert target is not None
+    return gain * (posture - target)
 
 
 class Actor(nn.Module):
@@ -52,7 +55,7 @@ class Actor(nn.Module):
         self.mean = tanh_layers(inputs, hidden, actions, gain=0.01)
         self.register_buffer("log_std", torch.zeros(actions))
 
-    def forward(self, aligned: Tensor, target: Tensor) -> Normal:
+    def forward(self, aligned: Tensor, target: Tensor | None) -> Normal:
         """Return the distribution of a_t [N, A], of B_t [N, D].
 
         The joint targets [N, A] in [-1, 1] are unused without `posture_gain`.
@@ -113,7 +116,7 @@ class SquashedActor(nn.Module):
         self.posture_gain = posture_gain
         self.layers = normed_layers(inputs, hidden, 2 * actions)
 
-    def forward(self, aligned: Tensor, target: Tensor) -> Squashed:
+    def forward(self, aligned: Tensor, target: Tensor | None) -> Squashed:
         """Return the distribution of a_t [N, A], of B_t [N, D].
 
         The joint targets [N, A] in [-1, 1] are unused without `posture_gain`.

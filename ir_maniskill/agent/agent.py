@@ -208,7 +208,8 @@ class Agent(nn.Module):
     @torch.no_grad()
     def policy(self, state: State) -> Tensor:
         """Return the policy's mean action [N, A] in [-1, 1], without any noise."""
-        self.spec.require(state, self.encoder.sensed)
+        target = ("target",) if self.config.posture_gain > 0 else ()
+        self.spec.require(state, (*self.encoder.sensed, *target))
         device = next(self.actor.parameters()).device
         here = {key: value.to(device) for key, value in state.items()}
         return self._distribution(here, self.encoder(here)).mean.clamp(-1, 1)
@@ -240,4 +241,5 @@ class Agent(nn.Module):
 
     def _distribution(self, state: State, aligned: Tensor) -> Any:
         """Return a `Normal`, or what is `Squashed`."""
-        return self.actor(aligned, state["target"][:, 0])
+        drawn = self.config.posture_gain > 0
+        return self.actor(aligned, state["target"][:, 0] if drawn else None)

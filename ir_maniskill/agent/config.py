@@ -37,9 +37,9 @@ class AgentConfig:
     """"gaussian": a deviation that a schedule sets; "squashed": one that is read from
     the state, and a tanh that keeps actions within [-1, 1]."""
     posture_gain: float = 0.0
-    """How strongly mean actions, changes of the joint targets, draw these toward the
-    posture that the actor's layers then give (it then knows the targets, whatever its
-    senses are); 0: the layers give the action itself."""
+    """How strongly mean actions (of a squashed actor: before the tanh), changes of the
+    joint targets, draw these toward the posture that its layers then give. It then
+    knows the targets, whatever its senses are. 0: the layers give the action itself."""
     hidden: tuple[int, ...] = (500, 256, 128)
     """Units of the actor's and the critic's tanh layers."""
     critic: CriticInput = "asymmetric"

@@ -21,6 +21,7 @@ from ir_maniskill.experiment import Experiment, Spoken
 from ir_maniskill.goals import (
     DIRECTIONS,
     FIXED,
+    MOVABLE,
     SHAPES,
     Goal,
     GoalError,
@@ -149,7 +150,7 @@ class GoalTable:
             names = [field.name for field in fields(kind)]
             values = {name: [getattr(goal, name) for goal in alike] for name in names}
             self._columns.append(
-                {n: _column(n, v, hands, kind.MOVES) for n, v in values.items()}
+                {n: _column(n, v, hands, n in kind.MOVES) for n, v in values.items()}
             )
 
     def deal(
@@ -236,14 +237,13 @@ def _refs(refs: list[Ref], device: torch.device, moves: bool) -> Deal:
                 f"{distinct[int(used[env])]}: got {int(masks[env].sum())} objects that "
                 f"fit in env {env}, expected exactly one of its {there}"
             )
-        fixed = masks & stays[scene.shape.clamp(min=0)] & counts[:, None] & moves
-        if fixed.any():
-            env, place = fixed.nonzero()[0].tolist()
-            shape = SHAPES[int(scene.shape[env, place])]
-            raise GoalError(
-                f"{distinct[int(used[env])]}: got a {shape} to move in env {env}, "
-                "expected what is not fixed to the table"
-            )
+        if moves:
+            fixed = masks & stays[scene.shape.clamp(min=0)] & counts[:, None]
+            if fixed.any():
+                env, place = fixed.nonzero()[0].tolist()
+                got = f"got a {SHAPES[int(scene.shape[env, place])]} to move"
+                ref = distinct[int(used[env])]
+                raise GoalError(f"{ref}: {got} in env {env}, expected {MOVABLE}")
         return masks
 
     return deal

@@ -159,22 +159,23 @@ class Speaker:
 
         What is to be moved must not be fixed.
         """
-        found = {ref: resolve(ref, scene) for ref in goal.refs}
-        fixed = [i for i, thing in enumerate(scene) if thing.shape in FIXED]
-        moves_fixed = any(found[ref] in fixed for ref in goal.moved)
-        return None not in found.values() and not moves_fixed
+        for ref in goal.refs:
+            index = resolve(ref, scene)
+            if index is None or (ref in goal.moved and scene[index].shape in FIXED):
+                return False
+        return True
 
     def can_ask(self, goal: Goal, scene: Sequence[Thing]) -> bool:
         """Return whether a goal that is true can be asked for in training's scenes."""
         allows = self.layout.allows(scene)
         acts = [(verb, i) for verb, ref in acts_of(goal) for i in _fits(ref, scene)]
         named = [i for ref in refs_of(goal) for i in _fits(ref, scene)]
-        known = all(
-            scene[i][:2] not in HELD_OBJECTS and allows([("name", i)]) for i in named
-        )
-        known &= all(status(verb, *scene[i][:2]) == "train" for verb, i in acts)
+        if any(status(verb, *scene[i][:2]) != "train" for verb, i in acts):
+            return False
+        if any(scene[i][:2] in HELD_OBJECTS for i in named):
+            return False
         together = [acts] if kind_of(goal) == "both" else [[act] for act in acts]
-        return known and all(map(allows, together))
+        return all(allows([("name", i)]) for i in named) and all(map(allows, together))
 
 
 def _rng(stream: np.random.RandomState) -> Random:

@@ -116,8 +116,12 @@ def acts_of(goal: Goal) -> list[tuple[str, Ref]]:
 
 def refs_of(goal: Goal) -> list[Ref]:
     """Return the references in a goal, and those in their relations."""
-    inner = [r.where.ref for r in goal.refs if isinstance(r.where, Relation)]
-    return [*goal.refs, *inner]
+    return [found for ref in goal.refs for found in _with_landmarks(ref)]
+
+
+def _with_landmarks(ref: Ref) -> list[Ref]:
+    beside = _with_landmarks(ref.where.ref) if isinstance(ref.where, Relation) else []
+    return [ref, *beside]
 
 
 # -- Words -----------------------------------------------------------------------------

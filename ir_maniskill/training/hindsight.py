@@ -47,7 +47,7 @@ class Judged:
     reward: Tensor
     """What the step to each row is worth [R, M]."""
     goal: Tensor
-    """What a critic is told of each goal, and of how far it is reached [R, M, D]."""
+    """What a critic is told of the scene, each goal and how far it is [R, M, D]."""
     named: Tensor
     """Middle of the objects that each sentence asks about [R, M, 3] [m]."""
     holds: Tensor
@@ -307,7 +307,7 @@ def describe(
 ) -> Tensor:
     """Return a scene, what a goal asks of it, and how far it is, as numbers [N, D].
 
-    They come from its measure alone, so they serve for any kind of goal.
+    Of a goal they tell what its measure says, so they serve for any kind.
     """
     serves, there = measure.serves, scene.color >= 0  # [N, F, C], [N, C]
     way = _nearest(measure.aim[:, None] - scene.to_object, serves)
@@ -342,7 +342,8 @@ def describe(
 def _order(scene: Snapshot, measure: Measure) -> Tensor:
     """Return the objects as critics read them, whatever slots they lie in [N, C].
 
-    First comes what a goal asks about, from right to left, then the nearest to that.
+    First comes what a goal asks about, from right to left, then the nearest to that; if
+    it asks about none, as `Avoid` does, the nearest to the torso.
     """
     asked, y = measure.serves.any(dim=1), scene.start[..., 1]  # [N, C]
     off = scene.start[..., :3] - _middle(scene.start[..., :3], measure)[:, None]

@@ -184,11 +184,11 @@ class SAC(Algorithm):
         the policy gets to; these are the more, the longer the training has lasted.
         """
         count = len(state["instruction"])
-        known = self._known(self._simulated(state))  # also while it is not needed
+        told = self._simulated(state)  # also while it is not needed
         if self.replay.written < self.config.random_steps:
             action = torch.rand(count, self.actions) * 2 - 1
         else:
-            action, _ = self._taught(known).rsample()
+            action, _ = self._taught(told).rsample()
             by_policy = round(self.config.policy_acts * self._schooling * count)
             if by_policy:
                 some = {name: value[:by_policy] for name, value in state.items()}
@@ -196,10 +196,10 @@ class SAC(Algorithm):
         self._past.append({**self._kept(state), "action": action})
         return action
 
-    def _taught(self, known: Tensor) -> Squashed:
-        """Return what the teacher would do [N, A], of what it reads [N, D]."""
+    def _taught(self, read: State) -> Squashed:
+        """Return what the teacher would do [N, A]."""
         with in_16_bits():
-            return self.teacher(known, known[:, : self.actions])
+            return self.teacher(self._known(read), read["now.target"])
 
     def _simulated(self, state: State) -> State:
         """Return what critics read of a state, before it is put together."""
@@ -335,7 +335,7 @@ class SAC(Algorithm):
         return Snapshot.unpack(rows, self.hindsight.fingers)
 
     def _known(self, read: State) -> Tensor:
-        """Return what critics and teacher read [B, D], the joint targets first."""
+        """Return what critics and teacher read [B, D]."""
         speed = (read["joint_velocity"] / 10).clamp(-1, 1)
         felt = read["now.target"], read["now.proprioception"]
         return torch.cat([*felt, speed, read["goal"]], dim=1)
@@ -354,9 +354,9 @@ class SAC(Algorithm):
         """Bring Q to r + gamma (Q' - temperature log pi), Q' being what follows."""
         temperature = self.log_temperature.detach().exp()
         with torch.no_grad():
-            after = self._known(under("next", now))
+            after = under("next", now)
             action, log_prob = self._taught(after).rsample()
-            future = self.slow(after, action).amin(dim=0)
+            future = self.slow(self._known(after), action).amin(dim=0)
             future = (future - temperature * log_prob) * ~now["terminal"]
             scale, gamma = self.config.reward_scale, self.config.gamma
             target = scale * now["reward"] + gamma * future
@@ -372,9 +372,9 @@ class SAC(Algorithm):
 
     def _improve_teacher(self, now: State) -> None:
         """Do what both critics value, as randomly as the target entropy asks."""
-        temperature, known = self.log_temperature.detach().exp(), self._known(now)
-        action, log_prob = self._taught(known).rsample()
-        value = self.critics(known, action).amin(dim=0)
+        temperature = self.log_temperature.detach().exp()
+        action, log_prob = self._taught(now).rsample()
+        value = self.critics(self._known(now), action).amin(dim=0)
         self._descend("teacher", (temperature * log_prob - value).mean())
         entropy = linear(*ENTROPY, max(0.0, 1.5 * self._learned - 0.5))
         excess = -entropy * self.actions - log_prob.detach().mean()
@@ -397,7 +397,7 @@ class SAC(Algorithm):
     def _imitation(self, now: State) -> Loss:
         """Return how far the policy is off the teacher and the truth."""
         with torch.no_grad():
-            shown = self._taught(self._known(now)).mean
+            shown = self._taught(now).mean
         encoder, scene = self.agent.encoder, self._scene(now["snapshot"])
         with in_16_bits():
             aligned = encoder(now)
