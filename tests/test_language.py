@@ -8,7 +8,6 @@ from ir_maniskill.goals import (
     COLORS,
     DIRECTIONS,
     EXTREMES,
-    FIXED,
     RELATIONS,
     SHAPES,
     Avoid,
@@ -61,10 +60,7 @@ def any_act(rng):
     """Return a touch or a push."""
     if rng.random() < 0.5:
         return Touch(any_ref(rng), rng.choice([None, "left", "right"]))
-    ref = any_ref(rng)
-    while ref.shape in FIXED:
-        ref = any_ref(rng)
-    return Push(ref, rng.choice([*DIRECTIONS]))
+    return Push(any_ref(rng), rng.choice([*DIRECTIONS]))
 
 
 def any_goal(rng):

@@ -219,7 +219,6 @@ def _fingers(hand: str | None, hands: Mapping[str, Tensor]) -> Tensor:
 
 def _refs(refs: list[Ref], device: torch.device, moves: bool) -> Deal:
     """Return how references become masks [N, C]; each is looked up once."""
-    stays = torch.tensor([shape in FIXED for shape in SHAPES], device=device)
     distinct = list(dict.fromkeys(refs))
     which = torch.tensor([distinct.index(ref) for ref in refs], device=device)
 
@@ -238,6 +237,7 @@ def _refs(refs: list[Ref], device: torch.device, moves: bool) -> Deal:
                 f"fit in env {env}, expected exactly one of its {there}"
             )
         if moves:
+            stays = torch.tensor([s in FIXED for s in SHAPES], device=device)
             fixed = masks & stays[scene.shape.clamp(min=0)] & counts[:, None]
             if fixed.any():
                 env, place = fixed.nonzero()[0].tolist()
