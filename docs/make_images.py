@@ -4,7 +4,6 @@ python docs/make_images.py                           # all
 python docs/make_images.py tasks NaoTouchCubeMulti-v1  # these
 """
 
-import argparse
 import csv
 import io
 import textwrap
@@ -18,6 +17,7 @@ from typing import Any
 
 import gymnasium as gym
 import torch
+import tyro
 from mani_skill.utils.sapien_utils import look_at
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -25,6 +25,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 import ir_maniskill  # noqa: F401 - registers the tasks
 from ir_maniskill import experiment as catalog
+from ir_maniskill.checks import require_choice
 from ir_maniskill.evaluation.evaluate import EVALUATION_SEED
 from ir_maniskill.evaluation.plots import style_axes
 from ir_maniskill.evaluation.video import Snapshot, record, write_video
@@ -219,8 +220,10 @@ def training(path: Path) -> None:
     write_video(path, shots)
 
 
-def main() -> None:
-    """Write what is asked for."""
+def main(
+    names: tyro.conf.Positional[tuple[str, ...]] = (), folder: Path = FOLDER
+) -> None:
+    """Write pictures and films into a folder: those that are named, or all."""
     pictures = {
         name: partial(save, make)
         for name, make in (
@@ -231,18 +234,14 @@ def main() -> None:
     }
     films = {task: partial(film, task) for task in FILMS}
     films |= {"failure": failure, "training": training}
-    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
-    parser.add_argument("names", nargs="*", help=f"of {', '.join(pictures | films)}")
-    parser.add_argument("--folder", type=Path, default=FOLDER)
-    given = parser.parse_args()
-    if unknown := set(given.names) - set(pictures | films):
-        parser.error(f"got {', '.join(unknown)}, expected some of the names")
-    given.folder.mkdir(exist_ok=True, parents=True)
-    for name in given.names or pictures | films:
-        path = given.folder / f"{name}.{'png' if name in pictures else 'gif'}"
+    for name in names:
+        require_choice("name", name, pictures | films)
+    folder.mkdir(exist_ok=True, parents=True)
+    for name in names or pictures | films:
+        path = folder / f"{name}.{'png' if name in pictures else 'gif'}"
         (pictures | films)[name](path)
         print(path, f"{path.stat().st_size / 1e6:.2f} MB")
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -150,7 +150,7 @@ def many_envs(seconds: float) -> Iterator[Row]:
 
 def learning(updates: int) -> Iterator[Row]:
     """Compare training with collecting alone, by the times that a run logs."""
-    steps = CONFIGS["default"].steps_per_update
+    steps = CONFIGS["default"].ppo.steps_per_update
     with tempfile.TemporaryDirectory() as folder:
         train(OURS, out=folder, total_steps=updates * steps, eval_episodes=3)
         rows = whole_rows(Path(folder) / "metrics.csv")

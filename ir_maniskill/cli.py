@@ -34,7 +34,6 @@ from ir_maniskill.training.config import (
     RenderBackend,
     SimBackend,
     TrainConfig,
-    leaves,
     require_same,
 )
 from ir_maniskill.training.run_folder import stored_config
@@ -339,7 +338,7 @@ class Doctor:
         return doctor.main([])
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str]) -> None:
     """Run the command line and exit with its code.
 
     The code is 0 if all went well, 1 if the doctor found a fault, 2 for a request that
@@ -353,7 +352,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             stream.reconfigure(errors="backslashreplace")
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     warnings.filterwarnings("ignore", module=r"(mani_skill|sapien|gymnasium)\b.*")
-    sys.exit(run(sys.argv[1:] if arguments is None else arguments))
+    sys.exit(run(arguments))
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -409,7 +408,7 @@ def parse(arguments: Sequence[str]) -> Any:
         return command
     if preset is not None:  # it is given as much as single numbers are
         given = for_experiment(command.train_config(), catalog.get(config.env_id))
-        require_same(stored, leaves(given))
+        require_same(stored, given)
     return _parse(arguments, stored)
 
 
@@ -476,7 +475,3 @@ def _describe(experiment: Experiment) -> tuple[str, str, str, str, str]:
         reward[experiment.reward] + penalty,
         ", ".join(experiment.senses),
     )
-
-
-if __name__ == "__main__":
-    main()

@@ -15,7 +15,7 @@ if [ -n "${TORCH_INDEX:-}" ]; then
     options+=(--index-url "$TORCH_INDEX")
 elif ! nvidia-smi >/dev/null 2>&1; then
     echo "No NVIDIA GPU here. If the next step downloads CUDA libraries, you may stop it and"
-    echo "run again with TORCH_INDEX=<address of PyTorch's index of CPU wheels> (see README.md)."
+    echo "run again with TORCH_INDEX=<address of PyTorch's index of CPU wheels> (see docs/install.md)."
 fi
 
 "$venv/bin/python" -m pip install --constraint "$constraints" "${options[@]}" torch

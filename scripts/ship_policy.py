@@ -6,11 +6,12 @@ beside it and inside.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import subprocess
 from contextlib import closing
 from pathlib import Path
+
+import tyro
 
 from ir_maniskill import evaluate, load_policy, make_vec
 from ir_maniskill import experiment as catalog
@@ -26,7 +27,9 @@ from ir_maniskill.training import checkpoint
 FOLDER = Path(__file__).parent.parent / "assets" / "policies"
 
 
-def ship(run: Path, episodes: int, scenes: int) -> EvaluationReport:
+def ship(
+    run: tyro.conf.Positional[Path], episodes: int = 200, scenes: int = 200
+) -> EvaluationReport:
     """Evaluate and write the best policy of a run.
 
     Args:
@@ -62,9 +65,4 @@ def _commit() -> str:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("run", type=Path, help="folder of the run")
-    parser.add_argument("--episodes", type=int, default=200, help="per sentence")
-    parser.add_argument("--scenes", type=int, default=200, help="for all sentences")
-    given = parser.parse_args()
-    print(ship(given.run, given.episodes, given.scenes))
+    print(tyro.cli(ship))

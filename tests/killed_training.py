@@ -35,7 +35,7 @@ def train(folder):
     every = {"total_steps": UPDATES * UPDATE, "checkpoint_interval": UPDATE}
     config = toy_config(folder, ppo=ppo, eval_interval=20 * UPDATE, **every)
     envs, evaluated_in = (ToyVectorEnv(config.num_envs) for _ in range(2))
-    training.train(config, resume=True, envs=envs, eval_envs=evaluated_in)
+    training.run(config, resume=True, envs=envs, eval_envs=evaluated_in)
 
 
 def killed_at_any_time(folder, generator):

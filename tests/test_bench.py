@@ -77,7 +77,7 @@ def test_bare_loop_drives_the_same_motion(multi_env):
 
 
 def test_training_is_timed_by_what_it_logs(monkeypatch):
-    steps = CONFIGS["default"].steps_per_update
+    steps = CONFIGS["default"].ppo.steps_per_update
 
     def train(task, *, out, total_steps, eval_episodes):
         assert (task, total_steps) == (bench.OURS, 3 * steps)

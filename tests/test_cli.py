@@ -15,7 +15,7 @@ from ir_maniskill.training.checkpoint import save_policy
 from ir_maniskill.training.config import (
     CONFIGS,
     TrainConfig,
-    to_json,
+    to_data,
 )
 from ir_maniskill.training.train import beginning_with, for_experiment
 
@@ -179,7 +179,7 @@ def test_a_run_that_is_resumed_gives_the_numbers_itself(monkeypatch, tmp_path, c
         CONFIGS["vision"], env_id=IDS[0], out=str(folder), seed=3, total_steps=9000
     )
     stored = for_experiment(stored, experiment.get(IDS[0]))
-    (folder / "config.json").write_text(to_json(stored))
+    (folder / "config.json").write_text(json.dumps(to_data(stored)))
     go_on = (IDS[0], "--out", str(folder), "--resume")
     config, resume = trained_with(monkeypatch, *go_on, "--threads", "1")
     assert (config, resume) == (dataclasses.replace(stored, threads=1), True)
@@ -205,7 +205,7 @@ def test_a_policy_to_begin_with_gives_what_its_weights_need(monkeypatch, tmp_pat
     assert config.sac == CONFIGS["listen"].sac
     stored = for_experiment(config, experiment.get(task))
     assert stored.agent.vocabulary == policy.agent.vocabulary  # it reads any text
-    (tmp_path / "config.json").write_text(to_json(stored))
+    (tmp_path / "config.json").write_text(json.dumps(to_data(stored)))
     for again in (told, (task, *out)):
         assert trained_with(monkeypatch, *again, "--resume")[0] == stored
 

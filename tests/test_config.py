@@ -8,31 +8,23 @@ from hypothesis import strategies as st
 from ir_maniskill.environment.reward_generator import RewardWeights
 from ir_maniskill.training.config import (
     CONFIGS,
-    SCHEMA,
     AgentConfig,
     ConfigError,
     PPOConfig,
     TrainConfig,
     from_data,
     leaves,
-    resumed,
     to_data,
-    to_json,
 )
 
 
-def from_json(text):
-    return from_data(json.loads(text))
+def through_json(config):
+    return from_data(json.loads(json.dumps(to_data(config))))
 
 
 @pytest.mark.parametrize("name", CONFIGS)
 def test_configs_survive_json(name):
-    assert from_json(to_json(CONFIGS[name])) == CONFIGS[name]
-
-
-def test_a_budget_scales_all_that_follows_the_steps():
-    for config in CONFIGS.values():
-        dataclasses.replace(config, total_steps=6000)
+    assert through_json(CONFIGS[name]) == CONFIGS[name]
 
 
 @pytest.mark.parametrize(
@@ -139,25 +131,11 @@ def test_whatever_a_config_says_it_is_a_config_or_refused(draw, value):
     except ConfigError as error:
         assert "got" in str(error)
         return
-    assert from_json(to_json(config)) == config
+    assert through_json(config) == config
     assert config.steps_per_env > 0
-
-
-# -- Resuming --------------------------------------------------------------------------
-
-
-def test_a_resumed_run_has_its_own_config_but_for_what_is_given():
-    ppo = PPOConfig(gamma=0.7)
-    stored = TrainConfig(env_id="A-v1", out="a", ppo=ppo, total_steps=60_000, seed=1)
-    given = TrainConfig(out="b", threads=1, seed=1)
-    expected = dataclasses.replace(stored, out="b", threads=1)
-    assert resumed(stored, given) == expected
-    wrong = dataclasses.replace(given, ppo=PPOConfig(gamma=0.8))
-    with pytest.raises(ConfigError, match=r"ppo.gamma \(run: 0.7, now: 0.8\)"):
-        resumed(stored, wrong)
 
 
 def test_the_leaves_of_a_config_are_all_its_numbers():
     names = leaves(TrainConfig())
     assert names["ppo.gamma"] == 0.9 and names["reward_weights.hold"] == 1.0
-    assert "ppo" not in names and to_data(TrainConfig())["schema"] == SCHEMA
+    assert "ppo" not in names

@@ -121,7 +121,7 @@ FILMS = [("a.mp4", (1280, 720)), ("B.MP4", (1280, 720)), ("a.gif", (640, 360))]
 def test_videos_play_and_hold_their_last_frame(name, size, tmp_path):
     path = tmp_path / "new" / name
     shots = [snapshot(step=step, right=[step]) for step in range(5)]
-    assert write_video(path, iter(shots), speed=0.5, hold=0.5) == 5
+    write_video(path, iter(shots), speed=0.5, hold=0.5)
     reader = imageio.get_reader(path)
     frames = [np.asarray(frame) for frame in reader]
     assert {(f.shape[1], f.shape[0]) for f in frames} == {size}

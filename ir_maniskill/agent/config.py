@@ -60,10 +60,10 @@ class AgentConfig:
         fits = 1 <= len(units) <= 100 and min(units) > 0
         require(fits, "hidden", units, "1 to 100 positive sizes")
         require_fields(self, "language_length", lambda x: x > 0, "at least 1")
-        require_fields(self, "auxiliary_weight", lambda x: x >= 0, "0 or more")
+        finite = "a finite number of at least 0"
+        weights = "auxiliary_weight posture_gain"
+        require_fields(self, weights, lambda x: 0 <= x < math.inf, finite)
         gain, senses = self.posture_gain, self.senses
-        fits = 0 <= gain < math.inf
-        require(fits, "posture_gain", gain, "a finite number of at least 0")
         felt = {"proprioception", "target", "state"} & set(senses or ())
         fits = gain == 0 or senses is None or bool(felt)
         require(fits, "posture_gain", gain, "0 where joints are not felt")

@@ -21,7 +21,7 @@ from gymnasium.spaces import Dict
 from torch import Tensor
 from tqdm import tqdm
 
-from ir_maniskill.checks import require, require_whole
+from ir_maniskill.checks import require_whole
 from ir_maniskill.environment.layout import layout_of
 from ir_maniskill.environment.robots import Nao
 from ir_maniskill.environment.senses import (
@@ -45,7 +45,7 @@ from ir_maniskill.evaluation.scripted import NotScriptedError, Scripted
 from ir_maniskill.experiment import Experiment, Spoken
 from ir_maniskill.goals import Goal, Instruction
 from ir_maniskill.language import SPLITS, draw, things
-from ir_maniskill.language.tokens import PAD, tokenize
+from ir_maniskill.language.tokens import tokenize
 
 log = logging.getLogger(__name__)
 
@@ -246,7 +246,7 @@ def controls(task: Experiment, space: Any) -> dict[str, Change]:
     if "agent" in parts:
         found["no joints"] = _with("agent", torch.zeros_like)
     if "instruction" in extra:
-        found["no sentence"] = _with("extra", _padding, "instruction", "text")
+        found["no sentence"] = _with("extra", torch.zeros_like, "instruction", "text")
         own = task.instructions
         if isinstance(own, Spoken) or len({i.goal for i in own}) > 1:
             found["another sentence"] = _another_sentence(task)
@@ -274,10 +274,6 @@ def _with(part: str, change: Callable[[Tensor], Tensor], *names: str) -> Change:
 
 def _of_another(leaf: Tensor) -> Tensor:
     return leaf.roll(1, dims=0)
-
-
-def _padding(leaf: Tensor) -> Tensor:
-    return torch.full_like(leaf, PAD)
 
 
 def _another_sentence(task: Experiment) -> Change:
@@ -330,11 +326,7 @@ def same_scene(player: Player, envs: VectorEnv, *, scenes: int, seed: int) -> li
     A policy that neither looks nor reads may have every single score by chance or by
     habit; only one that does both obeys all sentences in one scene. A fixed task has
     all of its sentences told, and a spoken one several that are true of the scene.
-
-    Raises:
-        ValueError: No scenes.
     """
-    require(scenes >= 1, "scenes", scenes, "at least 1")
     pairs = list(_told_in_each(envs, range(seed, seed + scenes)))
     if not pairs:
         return []

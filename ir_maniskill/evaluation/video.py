@@ -395,8 +395,8 @@ def write_video(
     speed: float = 0.5,
     hold: float = 1.0,
     total: int | None = None,
-) -> int:
-    """Draw what `record` yields into an mp4, or a small GIF; return how many it were.
+) -> None:
+    """Draw what `record` yields into an mp4, or a small GIF.
 
     Args:
         path: The file; its name ends in .mp4 or .gif.
@@ -411,19 +411,15 @@ def write_video(
     """
     require_writable(path, ENDINGS)
     rate = CONTROL_FREQ * speed
-    count = 0
 
     def frames() -> Iterator[np.ndarray]:
-        nonlocal count
         for snapshot in tqdm(snapshots, "film", total, leave=False, unit=" frames"):
             frame, last = draw(snapshot), snapshot.step == snapshot.total_steps
-            count += 1
             yield from [frame] * (1 + round(hold * rate) * last)
 
     write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
     with replacing(path) as aside:
         write(aside, frames(), rate)
-    return count
 
 
 def _write_mp4(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:

@@ -62,11 +62,11 @@ class Film:
         self._moments.append(Moment(session.choice.task, robot, scene, shot))
         del self._moments[: -LONGEST * CONTROL_FREQ]
 
-    def write(self, path: Path) -> int:
-        """Draw the film (.mp4, .gif); return how many frames it has."""
-        if not self._moments:
-            return 0
-        return video.write_video(path, self._frames(), speed=1.0, hold=0.0)
+    def write(self, path: Path) -> bool:
+        """Draw the film (.mp4, .gif); return whether there was anything to draw."""
+        if self._moments:
+            video.write_video(path, self._frames(), speed=1.0, hold=0.0)
+        return bool(self._moments)
 
     def _frames(self) -> Iterator[video.Snapshot]:
         with ExitStack() as opened:

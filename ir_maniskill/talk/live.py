@@ -77,8 +77,8 @@ def run(session: Session, host: str, port: int, record: Path | None = None) -> N
         with suppress(KeyboardInterrupt):
             keep_going(page, film)
     if film is not None and record is not None:
-        frames = film.write(record)
-        where = f"The film is in {record}." if frames else "Nobody watched: no film."
+        drawn = film.write(record)
+        where = f"The film is in {record}." if drawn else "Nobody watched: no film."
         log.info(where)
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import ClassVar
 
 import torch
@@ -85,12 +84,6 @@ class Algorithm(ABC):
     @abstractmethod
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
         """Go on from what `state_dict` returned."""
-
-    def keep_in(self, folder: Path) -> None:  # noqa: B027 - most have nothing to keep
-        """Learn where to keep what is too large for a checkpoint, before anything else.
-
-        Whoever goes on from a checkpoint is told the same folder.
-        """
 
     def restart(self) -> None:  # noqa: B027 - most have nothing to forget
         """Learn that all envs begin new episodes, though none was seen to end."""

@@ -7,7 +7,6 @@ bits each. Either tells for which task, words and robot it was trained.
 
 import dataclasses
 import json
-import random
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import metadata as packages
@@ -15,7 +14,6 @@ from pathlib import Path
 from textwrap import shorten
 from typing import Any
 
-import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load as parse_tensors
@@ -222,24 +220,16 @@ def _plain(value: Any) -> Any:
 # -- Random generators -----------------------------------------------------------------
 
 
-def random_state() -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Return the state of every random generator this process uses."""
+def random_state() -> dict[str, Tensor]:
+    """Return the state of torch's generators: nothing else here draws unseeded."""
     tensors = {"random.torch": torch.get_rng_state()}
     if torch.cuda.is_available():
         tensors["random.cuda"] = torch.cuda.get_rng_state()
-    name, keys, *rest = np.random.get_state()
-    tensors["random.numpy"] = torch.from_numpy(np.asarray(keys).astype(np.int64))
-    version, state, gauss = random.getstate()
-    return tensors, {"numpy": [name, *rest], "python": [version, list(state), gauss]}
+    return tensors
 
 
-def set_random_state(tensors: Mapping[str, Tensor], plain: Mapping[str, Any]) -> None:
-    """Put every random generator back to what `random_state` returned."""
+def set_random_state(tensors: Mapping[str, Tensor]) -> None:
+    """Put the generators back to what `random_state` returned."""
     torch.set_rng_state(tensors["random.torch"])
     if torch.cuda.is_available() and "random.cuda" in tensors:
         torch.cuda.set_rng_state(tensors["random.cuda"])
-    name, *rest = plain["numpy"]
-    keys = tensors["random.numpy"].numpy().astype(np.uint32)
-    np.random.set_state((name, keys, *rest))
-    version, state, gauss = plain["python"]
-    random.setstate((version, tuple(state), gauss))

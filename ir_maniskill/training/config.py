@@ -1,7 +1,6 @@
 """Every number of a training run, as frozen dataclasses that survive JSON."""
 
 import dataclasses
-import json
 import math
 import typing
 from dataclasses import dataclass, field
@@ -222,11 +221,6 @@ class TrainConfig:
         """T, the steps each env makes for one update."""
         return -(-self.ppo.steps_per_update // self.num_envs)
 
-    @property
-    def steps_per_update(self) -> int:
-        """T x N, the steps all envs make for one update."""
-        return self.steps_per_env * self.num_envs
-
     def env_kwargs(self, *, training: bool) -> dict[str, Any]:
         """Keyword arguments for `gym.make`, for training or for using the policy."""
         agent, senses = self.agent, self.agent.senses
@@ -323,11 +317,6 @@ pictures alone, "paper" as published, "listen" for many sentences, by hindsight.
 # -- Files -----------------------------------------------------------------------------
 
 
-def to_json(config: TrainConfig) -> str:
-    """Return the JSON text of a configuration."""
-    return json.dumps(to_data(config), indent=2)
-
-
 def to_data(config: TrainConfig) -> dict[str, Any]:
     """Return a configuration as plain data, with the version of its form."""
     return {"schema": SCHEMA, **dataclasses.asdict(config)}
@@ -366,24 +355,13 @@ def _decode(cls: Any, data: Any) -> Any:
 # -- Resuming --------------------------------------------------------------------------
 
 
-def resumed(stored: TrainConfig, given: TrainConfig) -> TrainConfig:
-    """Return a run's own config, but for what may change and is given.
-
-    Given counts what differs from `TrainConfig()`. ConfigError: it may not change.
-    """
-    usual = leaves(TrainConfig())
-    told = {k: v for k, v in leaves(given).items() if v != usual[k] or k == "out"}
-    require_same(stored, leaves(stored) | told)
-    changes = {name: value for name, value in told.items() if name in MAY_CHANGE}
-    return dataclasses.replace(stored, **changes)
-
-
-def require_same(stored: TrainConfig, now: dict[str, Any]) -> None:
-    """Raise ConfigError unless `leaves` are those of the run, or may change."""
+def require_same(stored: TrainConfig, now: TrainConfig) -> None:
+    """Raise ConfigError unless a config is the run's, but for what may change."""
+    given = leaves(now)
     different = [
-        f"{name} (run: {value!r}, now: {now[name]!r})"
+        f"{name} (run: {value!r}, now: {given[name]!r})"
         for name, value in leaves(stored).items()
-        if name not in MAY_CHANGE and now[name] != value
+        if name not in MAY_CHANGE and given[name] != value
     ]
     if different:
         raise ConfigError(

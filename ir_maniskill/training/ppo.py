@@ -122,7 +122,7 @@ class PPO(Algorithm):
             **copied("agent", self.agent.state_dict()),
             **copied("optimizer", averages(self.optimizer)),
             "learning_rate": torch.tensor(rate, dtype=torch.float64),
-            "reward_scale": self.reward_scale.state(),
+            **copied("reward_scale", self.reward_scale.seen.state_dict()),
         }
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
@@ -131,7 +131,7 @@ class PPO(Algorithm):
         load_averages(self.optimizer, under("optimizer", tensors))
         for group in self.optimizer.param_groups:
             group["lr"] = float(tensors["learning_rate"])
-        self.reward_scale.load_state(tensors["reward_scale"])
+        self.reward_scale.seen.load_state_dict(under("reward_scale", tensors))
 
 
 def values_of(agent: Agent, state: State, chosen: Tensor) -> Tensor:

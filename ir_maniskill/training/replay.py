@@ -27,20 +27,16 @@ how many there are."""
 
 
 class Replay:
-    """Rows in a ring of limited size: in memory, or in files that outlive it."""
+    """Rows in a ring of limited size, in files that outlive it."""
 
-    def __init__(self, capacity: int) -> None:
-        """Have room for that many rows, once it is known what is in one."""
+    def __init__(self, capacity: int, folder: Path) -> None:
+        """Have room for that many rows in files, once it is known what is in one."""
         self.capacity = capacity
         self.written = 0
         """Rows written so far, also those that have made room since."""
         self.episodes = 0
-        self._folder: Path | None = None
-        self._rows: Rows = {}
-
-    def keep_in(self, folder: Path) -> None:
-        """Keep the rows in files of this folder, before any were added."""
         self._folder = folder
+        self._rows: Rows = {}
 
     def __len__(self) -> int:
         return min(self.written, self.capacity)
@@ -89,15 +85,13 @@ class Replay:
 
     def _require_space(self, size: int) -> None:
         """Raise OSError if the disk has less: mapped files would kill the process."""
-        if self._folder is None or disk_usage(self._folder).free >= size:
+        if disk_usage(self._folder).free >= size:
             return
         with writing(self._folder):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def _kept(self, name: str, rows: Tensor) -> Tensor:
-        """Return room for such rows, which are all 0: in memory, or in a new file."""
-        if self._folder is None:
-            return rows.clone()
+        """Return room for such rows in a new file, all 0."""
         self._folder.mkdir(parents=True, exist_ok=True)
         path, kind = self._folder / f"{name}.npy", rows.numpy().dtype
         return torch.from_numpy(open_memmap(path, "w+", kind, tuple(rows.shape)))
@@ -153,13 +147,11 @@ class Replay:
         return {"written": torch.tensor([self.written, self.episodes])}
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        """Go on with the rows in the folder; without one, with none.
+        """Go on with the rows in the folder.
 
         Raises:
             ValueError: They are not there, or there is room for more or fewer.
         """
-        if self._folder is None:
-            return
         written, episodes = tensors["written"].tolist()
         if not written:
             return

@@ -171,15 +171,3 @@ class RewardScale:
     def restart(self) -> None:
         """Forget the running returns: every env starts a new episode."""
         self.running = torch.zeros_like(self.running)
-
-    def state(self) -> Tensor:
-        """Return what has to survive a restart of the program [3]."""
-        seen = self.seen
-        return torch.cat([seen.count[None], seen.mean, seen.variance])
-
-    def load_state(self, state: Tensor) -> None:
-        """Go on from what `state` returned."""
-        count, mean, variance = state.double()
-        self.seen.load_state_dict(
-            {"count": count, "mean": mean[None], "variance": variance[None]}
-        )

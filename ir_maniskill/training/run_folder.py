@@ -16,10 +16,10 @@ from typing import Any
 from torch.utils.tensorboard import SummaryWriter
 
 from ir_maniskill.checks import ConfigError
-from ir_maniskill.files import replacing, require_writable, writing
+from ir_maniskill.files import replacing, require_writable, write_json, writing
 from ir_maniskill.training import checkpoint
 from ir_maniskill.training.checkpoint import CheckpointError, Stored
-from ir_maniskill.training.config import TrainConfig, from_data, to_json
+from ir_maniskill.training.config import TrainConfig, from_data, to_data
 
 log = logging.getLogger(__name__)
 
@@ -90,7 +90,7 @@ class RunFolder:
         for leftover in self.path.glob(".[0-9]*.*"):  # of a process that was killed
             leftover.unlink()
         self._events = SummaryWriter(str(self.path), purge_step=steps + 1)
-        self.write("config.json", (to_json(config) + "\n").encode())
+        write_json(self.path / "config.json", to_data(config))
         self._cut("metrics", steps)
         # The evaluation of what a run begins with is made again, and without the best
         # policy the last one is, to have one.

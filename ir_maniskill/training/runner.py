@@ -6,7 +6,6 @@ It knows nothing of how the algorithm learns. Legend: N envs.
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -22,6 +21,7 @@ from ir_maniskill.environment.process_vector import ProcessVectorEnv, Step
 from ir_maniskill.environment.senses import State, StateStack
 from ir_maniskill.environment.vector import VectorEnv, info_of_step
 from ir_maniskill.evaluation.evaluate import EvaluationReport, evaluate_policy
+from ir_maniskill.files import write_json
 from ir_maniskill.language import KINDS
 from ir_maniskill.training import checkpoint, distributed
 from ir_maniskill.training.algorithm import Algorithm, Outcome
@@ -71,7 +71,6 @@ class Runner:
         self.device = algorithm.device()
         self.stack, self.counts = StateStack(config.frames), StepCounts()
         self.steps, self.saved, self.evaluated = 0, 0, 0
-        self.seconds = {"collect": 0.0, "update": 0.0}
         self.best_score = -math.inf
         torch.manual_seed(config.seed)
         # The cores belong to the simulator's workers and to the pieces of a batch.
@@ -79,7 +78,6 @@ class Runner:
         self.state = self._new_scenes()
         actions = math.prod(envs.single_action_space.shape or ())
         self.algorithm = algorithm(config, self.state, actions)
-        self.algorithm.keep_in(folder.path)
 
     # -- The loop --------------------------------------------------------------------
 
@@ -113,12 +111,12 @@ class Runner:
     def advance(self) -> Figures:
         """Step the envs until the algorithm has learned something."""
         figures: Figures = {}
-        self.seconds = {"collect": 0.0, "update": 0.0}
+        self.seconds = {"update": 0.0}
+        started = time.perf_counter()
         while not figures:
-            started = time.perf_counter()
             figures = self.step()
-            self.seconds["collect"] += time.perf_counter() - started
-        self.seconds["collect"] -= self.seconds["update"]
+        spent = time.perf_counter() - started
+        self.seconds["collect"] = spent - self.seconds["update"]
         means, self.counts = self.counts.means(), StepCounts()
         figures = {f"train/{k}": v for k, v in means.items()} | figures
         figures |= {f"time/{k}": v for k, v in self.seconds.items()}  # [s]
@@ -218,8 +216,7 @@ class Runner:
         tqdm.write(f"The best policy, of step {metadata['steps']}, in other scenes:")
         tqdm.write(str(report))
         figures = self._keep(agent, metadata["steps"], report)
-        text = json.dumps(figures, indent=2) + "\n"
-        self.folder.write("evaluation.json", text.encode())
+        write_json(self.folder.path / "evaluation.json", figures)
 
     def _report(self, agent: Agent, episodes: int, seed: int) -> EvaluationReport:
         """Evaluate an agent without holding what training goes on with."""
@@ -232,7 +229,7 @@ class Runner:
             frames=self.config.frames,
             progress=True,
         )
-        checkpoint.set_random_state(*random)
+        checkpoint.set_random_state(random)
         return report
 
     def _keep(
@@ -256,10 +253,9 @@ class Runner:
 
     def snapshot(self) -> Stored:
         """Return everything the run needs to go on, as of now."""
-        tensors, plain = checkpoint.random_state()
-        facts = {"steps": self.steps, "best_score": self.best_score, "random": plain}
+        facts = {"steps": self.steps, "best_score": self.best_score}
         metadata = checkpoint.describe(self.algorithm.agent, self.config, **facts)
-        tensors |= self.algorithm.state_dict()
+        tensors = checkpoint.random_state() | self.algorithm.state_dict()
         return Stored(checkpoint.CHECKPOINT, tensors, metadata)
 
     def save(self) -> None:
@@ -293,7 +289,7 @@ class Runner:
         """
         try:
             self.algorithm.load_state_dict(stored.tensors)
-            checkpoint.set_random_state(stored.tensors, stored.metadata["random"])
+            checkpoint.set_random_state(stored.tensors)
             if self.folder.best.exists():  # else the next evaluation's is the best
                 checkpoint.read(self.folder.best)  # better refused now than at the end
                 self.best_score = float(stored.metadata["best_score"])

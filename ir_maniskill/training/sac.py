@@ -161,7 +161,7 @@ class SAC(Algorithm):
             "critics": adam(self.critics.parameters(), rate),
             "temperature": adam([self.log_temperature], TEMPERATURE_RATE),
         }
-        self.replay = Replay(config.sac.capacity)
+        self.replay = Replay(config.sac.capacity, Path(config.out) / "replay")
         self.updates = 0
         self._history: dict[str, list[Tensor]] = defaultdict(list)
         self._past: list[State] = []
@@ -169,10 +169,6 @@ class SAC(Algorithm):
         self._began: Tensor
         """Of each env, which of them its episode began with."""
         self.restart()
-
-    def keep_in(self, folder: Path) -> None:
-        """Keep the replay there."""
-        self.replay.keep_in(folder / "replay")
 
     # -- Collecting ------------------------------------------------------------------
 

@@ -26,9 +26,7 @@ from ir_maniskill.training.config import (
     WITH_WEIGHTS,
     TrainConfig,
     from_data,
-    leaves,
     require_same,
-    resumed,
 )
 from ir_maniskill.training.ppo import PPO
 from ir_maniskill.training.run_folder import RunFolder, stored_config
@@ -42,7 +40,7 @@ ALGORITHMS: dict[str, type[Algorithm]] = {"ppo": PPO, "sac": SAC}
 
 
 def train(
-    task: str | TrainConfig,
+    task: str,
     resume: bool = False,
     envs: VectorEnv | None = None,
     eval_envs: VectorEnv | None = None,
@@ -58,7 +56,7 @@ def train(
     Where torchrun started several processes, each trains on its share of the envs.
 
     Args:
-        task: [MODULE:]ID of the task, or the whole configuration of the training.
+        task: [MODULE:]ID of the task.
         resume: Go on from the folder's last checkpoint, if there is one, with the
             folder's own config; of what is given only `MAY_CHANGE` may differ from it.
         envs: Vector of this rank's envs to use (and leave open) instead of making one.
@@ -66,8 +64,8 @@ def train(
         algorithm: What learns; None: what the config names.
         preset: Which of `CONFIGS` to train a task with; a run that is resumed keeps
             its own.
-        **changes: Fields that shall be other than in the preset, or in `task`; a dict
-            changes some of a part, e.g. `ppo={"gamma": 0.95}`. With `init_from`, the
+        **changes: Fields that shall be other than in the preset; a dict changes some
+            of a part, e.g. `ppo={"gamma": 0.95}`. With `init_from`, the
             policy decides instead of the preset what its weights need.
 
     Raises:
@@ -82,34 +80,17 @@ def train(
         WorkerError: If a simulator process died or hangs.
     """
     changes = {k: str(v) if isinstance(v, Path) else v for k, v in changes.items()}
-    if isinstance(task, str):
-        require_choice("preset", preset, CONFIGS)
-        for name in changes:
-            require_choice("argument of train", name, vars(CONFIGS[preset]))
-        if envs is None:
-            task = catalog.get(task).id  # without its module
-        changes = {"env_id": task, "out": f"runs/{task}", **changes}
-        stored = stored_config(Path(changes["out"])) if resume else None
-        usual = stored or beginning_with(changes.get("init_from"), CONFIGS[preset])
-        config = _changed(usual, changes)
-    else:
-        require(isinstance(task, TrainConfig), "task", task, "an id or a TrainConfig")
-        expected = "none beside a TrainConfig, which has all numbers"
-        require(preset == "default", "preset", preset, expected)
-        config = _changed(task, changes)
-        if ":" in config.env_id:
-            env_id = catalog.get(config.env_id).id  # without its module
-            config = dataclasses.replace(config, env_id=env_id)
-        stored = stored_config(Path(config.out)) if resume else None
-        if stored is not None:
-            experiment = envs.experiment if envs else catalog.get(stored.env_id)
-            # `run` compares the words with the task's.
-            senses = config.agent.senses or experiment.senses
-            agent = dataclasses.replace(
-                config.agent, senses=senses, vocabulary=stored.agent.vocabulary
-            )
-            config = resumed(stored, dataclasses.replace(config, agent=agent))
-    return run(config, resume, envs, eval_envs, algorithm)
+    require(isinstance(task, str), "task", task, "an id")
+    require_choice("preset", preset, CONFIGS)
+    known = [name for name in vars(CONFIGS[preset]) if name != "env_id"]
+    for name in changes:
+        require_choice("argument of train", name, known)
+    if envs is None:
+        task = catalog.get(task).id  # without its module
+    changes = {"env_id": task, "out": f"runs/{task}", **changes}
+    stored = stored_config(Path(changes["out"])) if resume else None
+    usual = stored or beginning_with(changes.get("init_from"), CONFIGS[preset])
+    return run(_changed(usual, changes), resume, envs, eval_envs, algorithm)
 
 
 def _changed(config: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
@@ -145,7 +126,7 @@ def run(
         # Read while the folder is ours: another run may have ended there meanwhile.
         stored = distributed.from_first(folder.read_last)
         if stored is not None:
-            require_same(from_data(stored.metadata["config"]), leaves(config))
+            require_same(from_data(stored.metadata["config"]), config)
         if envs is None:
             envs = make_envs(config, config.num_envs // distributed.size())
             leaving.callback(envs.close)
