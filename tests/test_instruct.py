@@ -13,7 +13,7 @@ from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.arguments import instructions_of
 from ir_maniskill.environment.layout import layout_of
 from ir_maniskill.environment.robots import Nao, Panda
-from ir_maniskill.environment.speaker import Speaker, resolve
+from ir_maniskill.environment.speaker import Speaker, _fits
 from ir_maniskill.experiment import (
     Drawn,
     Experiment,
@@ -151,7 +151,7 @@ def test_sentences_are_of_their_split_and_true_of_their_scene(
         new = split if split in ("objects", "pairs") else "train"
         assert split_of(said.goal) == new
         if split != "objects":
-            acts = [(verb, resolve(ref, scene)) for verb, ref in acts_of(said.goal)]
+            acts = [(verb, _fits(ref, scene)[0]) for verb, ref in acts_of(said.goal)]
             fits = [ref.resolve(scene_of(scene))[0] for ref in refs_of(said.goal)]
             named = [thing for each in fits for thing in compress(scene, each)]
             assert not {thing[:2] for thing in named} & HELD_OBJECTS

@@ -21,7 +21,7 @@ from ir_maniskill.environment.robots.robot import (
     JointGroup,
     Robot,
     RobotError,
-    find_robot,
+    robot_class,
 )
 from ir_maniskill.environment.robots.urdf import read_motors
 from ir_maniskill.environment.touch_env import TouchEnv
@@ -160,14 +160,13 @@ def test_robots_have_short_names_that_leave_others_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for name, robot in ROBOTS.items():
-        assert find_robot(name) == find_robot(robot.uid) == robot.uid
-        assert find_robot(robot) is robot
+        assert all(robot_class(known) is robot for known in (name, robot.uid, robot))
     assert not issubclass(REGISTERED_AGENTS["panda"].agent_cls, Robot)
     for unknown in ("unitree_g1", "moon"):
         with pytest.raises(RobotError, match=f"got '{unknown}'.*nao, .*panda"):
-            find_robot(unknown)
+            robot_class(unknown)
     monkeypatch.setitem(REGISTERED_AGENTS, "g1", REGISTERED_AGENTS["nao"])
-    assert find_robot("g1") == "g1"  # somebody's own
+    assert robot_class("g1") is ROBOTS["nao"]  # somebody's own
 
 
 # -- Pictures ------------------------------------------------------------------

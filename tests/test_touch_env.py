@@ -21,7 +21,7 @@ from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.robots.nao import JOINTS, Nao
 from ir_maniskill.environment.touch_env import CONTACT_OFFSET, TouchEnv
 from ir_maniskill.experiment import Jitter
-from ir_maniskill.goals import Instruction, Ref, Touch
+from ir_maniskill.goals import Instruction, Ref, Then, Touch
 
 IDS = ir_maniskill.available()[:8]
 QUICK = ("NaoTouchButtonMulti-v1", "NaoTouchCubeShuffled-v1")
@@ -317,6 +317,22 @@ def test_asking_again_changes_nothing_and_a_state_has_no_touches(
     *_, again = hold(fixed, **PRESS)
     assert again["wrong_once"].item()
     assert base.get_info()["wrong_fingers"] == again["wrong_fingers"]
+
+
+def test_a_stage_that_was_just_reached_counts_from_the_next_step(
+    fixed: gym.Env,
+) -> None:
+    red = Touch(Ref("red"))
+    twice = Instruction("Once, and once more.", Then(red, red))
+    fixed.reset(seed=0, options={"instruction": twice})
+    for _ in range(20):
+        *_, info = hold(fixed, steps=1, **PRESS)
+        if fixed.unwrapped.judged().stage.item():
+            break
+    again = fixed.unwrapped.get_info()
+    assert again["contact"].any() and not again["success"] and not info["success"]
+    *_, info = hold(fixed, steps=1, **PRESS)
+    assert info["success"].item()
 
 
 def test_what_was_told_in_an_earlier_episode_is_not_restored(fixed: gym.Env) -> None:

@@ -147,11 +147,11 @@ class GoalTable:
         self._columns: list[dict[str, Deal]] = []
         for kind in self.kinds:
             alike = [goal for goal in goals if type(goal) is kind]
-            names = [field.name for field in fields(kind)]
-            values = {name: [getattr(goal, name) for goal in alike] for name in names}
-            self._columns.append(
-                {n: _column(n, v, hands, n in kind.MOVES) for n, v in values.items()}
-            )
+            columns = {}
+            for name in (field.name for field in fields(kind)):
+                values = [getattr(goal, name) for goal in alike]
+                columns[name] = _column(name, values, hands, name in kind.MOVES)
+            self._columns.append(columns)
 
     def deal(
         self, index: Tensor, scene: Snapshot, counts: Tensor | None = None

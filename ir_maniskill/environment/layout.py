@@ -109,17 +109,14 @@ class Free:
         xy = np.zeros((*wanted.shape, 2))
         found = np.zeros(wanted.shape, dtype=bool)
         for slot in range(self.slots):
-            fits = self.reached(tried[:, slot])  # [b, K]
+            near = [self._touches(hand, tried[:, slot]) for hand in self.hands]
+            fits = np.any(near, axis=0)  # [b, K]
             for other in range(slot):
                 gap = np.linalg.norm(tried[:, slot] - xy[:, None, other], axis=-1)
                 fits &= (gap >= self.drawn.apart) | ~found[:, None, other]
             xy[:, slot] = tried[scenes, slot, fits.argmax(axis=1)]
             found[:, slot] = fits.any(axis=1) & wanted[:, slot]
         return found, xy
-
-    def reached(self, xy: np.ndarray) -> np.ndarray:
-        """Return whether some hand touches what is at these places [..., 2]: [...]."""
-        return np.any([self._touches(hand, xy) for hand in self.hands], axis=0)
 
     # -- What can be asked -----------------------------------------------------------
 
@@ -139,17 +136,13 @@ class Free:
                 return False
             if others:
                 return self._can_both(acts, things)
-            return self._can(verb, index, things)
+            first, _, last = verb.partition(" ")
+            if first == "push":
+                return self._can_push(last, index, things)
+            at, hands = np.array(things[index][2:]), hands_of([verb]) or self.hands
+            return any(self._touches(hand, at) for hand in hands)
 
         return allowed
-
-    def _can(self, verb: str, index: int, things: Sequence[Thing]) -> bool:
-        *_, x, y = things[index]
-        first, _, last = verb.partition(" ")
-        if first == "push":
-            return self._can_push(last, index, things)
-        hands = hands_of([verb]) or self.hands
-        return any(self._touches(hand, np.array((x, y))) for hand in hands)
 
     def _touches(self, hand: str, xy: np.ndarray) -> np.ndarray:
         """Return whether a hand touches what is at these places [..., 2]: [...]."""

@@ -237,9 +237,7 @@ def text_of(sentences: Sequence[str], length: int = TEXT_BYTES) -> Tensor:
 
 def read_text(rows: Tensor) -> list[str]:
     """Return the sentences that `text_of` wrote."""
-    padded, width = rows.cpu().numpy().tobytes(), rows.shape[1]
-    starts = range(0, len(padded), width) if width else [0] * len(rows)
-    return [padded[i : i + width].rstrip(b"\0").decode() for i in starts]
+    return [row.tobytes().rstrip(b"\0").decode() for row in rows.cpu().numpy()]
 
 
 def _padded(rows: list[list[int]], length: int, dtype: torch.dtype) -> Tensor:

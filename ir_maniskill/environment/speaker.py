@@ -160,8 +160,10 @@ class Speaker:
         What is to be moved must not be fixed.
         """
         for ref in goal.refs:
-            index = resolve(ref, scene)
-            if index is None or (ref in goal.moved and scene[index].shape in FIXED):
+            fits = _fits(ref, scene)
+            if len(fits) != 1:
+                return False
+            if ref in goal.moved and scene[fits[0]].shape in FIXED:
                 return False
         return True
 
@@ -182,13 +184,8 @@ def _rng(stream: np.random.RandomState) -> Random:
     return Random(int(stream.uniform() * 2**53))
 
 
-def resolve(ref: Ref, scene: Sequence[Thing]) -> int | None:
-    """Return which object of a scene a reference fits; None: none, or several."""
-    fits = _fits(ref, scene)
-    return fits[0] if len(fits) == 1 else None
-
-
 def _fits(ref: Ref, scene: Sequence[Thing]) -> list[int]:
+    """Return which objects of a scene a reference fits."""
     found: list[int] = ref.resolve(scene_of(scene))[0].nonzero().flatten().tolist()
     return found
 

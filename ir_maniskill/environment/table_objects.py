@@ -55,7 +55,8 @@ class TableObjects:
         kinds = [(list(COLORS).index(o.color), SHAPES.index(o.shape)) for o in things]
         self._kinds = torch.tensor(kinds, device=device)  # [B, 2]
         z = [scale * (table_scene.TABLE_TOP + h) for h in height]
-        self._z = torch.tensor(z, dtype=torch.float32, device=device)  # [B] [m]
+        self.z = torch.tensor(z, dtype=torch.float32, device=device)
+        """Height of each body's middle while it stands on the table [B] [m]."""
         self._gpu = scene.gpu_sim_enabled
         self._shown = [True] * len(things)  # on the CPU: whether they are simulated
         shape = scene.num_envs, experiment.slots
@@ -80,7 +81,7 @@ class TableObjects:
             Their poses, zeros in empty slots [b, C, 7].
         """
         taken = (slot >= 0)[..., None]  # [b, C, 1]
-        pose = torch.cat([xy, self._z[slot][..., None], rotation], dim=-1) * taken
+        pose = torch.cat([xy, self.z[slot][..., None], rotation], dim=-1) * taken
         upright = torch.tensor([1.0, 0, 0, 0], device=pose.device)
         self.put(env_idx, slot)
         for index, body in enumerate(self.bodies):

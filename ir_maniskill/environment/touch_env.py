@@ -33,15 +33,10 @@ from ir_maniskill.environment.layout import layout_of
 from ir_maniskill.environment.rendering import RenderedEnv
 from ir_maniskill.environment.reward_generator import RewardWeights
 from ir_maniskill.environment.robots import Nao
-from ir_maniskill.environment.robots.robot import (
-    Robot,
-    available_robots,
-    find_robot,
-    robot_class,
-)
+from ir_maniskill.environment.robots.robot import Robot, robot_class
 from ir_maniskill.environment.speaker import Speaker
 from ir_maniskill.environment.table_objects import TableObjects
-from ir_maniskill.experiment import Experiment, Spoken
+from ir_maniskill.experiment import Spoken
 from ir_maniskill.goals import Instruction
 from ir_maniskill.snapshot import Snapshot, later
 
@@ -82,14 +77,13 @@ class TouchEnv(RenderedEnv):
     """
 
     metadata: ClassVar = {**BaseEnv.metadata, "render_fps": CONTROL_FREQ}
-    SUPPORTED_ROBOTS: tuple[str | type[Robot], ...] = (Nao.uid,)
     SUPPORTED_REWARD_MODES = ("sparse", "dense", "normalized_dense", "none")
     agent: Robot
 
     def __init__(
         self,
         *args: Any,
-        experiment: str | Experiment,
+        experiment: str,
         robot_uids: str | type[Robot] = Nao.uid,
         render_backend: str | None = "auto",
         reward_weights: dict[str, float] | None = None,
@@ -100,7 +94,7 @@ class TouchEnv(RenderedEnv):
         """Build the env.
 
         Args:
-            experiment: The experiment or its id.
+            experiment: Its id.
             robot_uids: Which robot: "nao", "g1", "panda", the uid of another that is
                 registered, or a subclass of `Robot`.
             render_backend: As for `BaseEnv`; "auto" is a CUDA device where there is
@@ -120,13 +114,11 @@ class TouchEnv(RenderedEnv):
                 is nothing of that name to observe.
             RuntimeError: No Vulkan device can render here; says what to install.
         """
-        if not isinstance(experiment, Experiment):
-            experiment = catalog.get(experiment)
-        self.experiment = experiment.in_split(split)
+        self.experiment = catalog.get(experiment).in_split(split)
         _require_one_on_cpu(kwargs)
-        robot_uids = find_robot(robot_uids)
-        # ManiSkill warns of robots that are not in here; ours are not the only ones.
-        self.SUPPORTED_ROBOTS = (*available_robots(), robot_uids)
+        robot = robot_class(robot_uids)
+        if not isinstance(robot_uids, type):
+            robot_uids = robot.uid
         self._reward_weights = RewardWeights().changed(reward_weights or {})
         self.asked = senses.require_askable(observe)
         self._stepped = False  # whether a step was made that is not judged yet
@@ -177,13 +169,14 @@ class TouchEnv(RenderedEnv):
             for hand, mine in self.agent.hands.items()
         }
         self.instructional_set = InstructionalSet(task, hands, device, count)
-        self._layout = layout_of(task, self.agent)
+        self.layout = layout_of(task, self.agent)
         spoken = isinstance(task.instructions, Spoken)
-        self._speaker = Speaker(task, self._layout) if spoken else None
+        self._speaker = Speaker(task, self.layout) if spoken else None
         self._touch = self.agent.touch_sensor(self.objects)
         self._weights = self._reward_weights.vector().to(device)
         self.instruction_index = torch.zeros(count, dtype=torch.int64, device=device)
         self._stage = torch.zeros_like(self.instruction_index)
+        self._stage_before = self._stage  # with which the last step began
         self._success_once = torch.zeros(count, dtype=torch.bool, device=device)
         self._wrong_once = torch.zeros_like(self._success_once)
         self._start = torch.zeros(count, task.slots, 7, device=device)
@@ -194,7 +187,7 @@ class TouchEnv(RenderedEnv):
 
     def _initialize_episode(self, env_idx: Tensor, options: dict) -> None:
         slots, joints = self.experiment.slots, len(self.agent.start_qpos)
-        laid = self._layout.noise if self._speaker is None else 0  # it draws its own
+        laid = self.layout.noise if self._speaker is None else 0  # it draws its own
         sizes = [1, laid, slots, joints]
         noise = self._batched_episode_rng[env_idx].uniform(size=sum(sizes))
         pick, layout, yaw, joint = np.split(noise, np.cumsum(sizes)[:-1], axis=1)
@@ -202,7 +195,7 @@ class TouchEnv(RenderedEnv):
         if told is not None:
             told = instructions_of(told, self.experiment, len(env_idx))
         if self._speaker is None:
-            slot, xy = self._layout.lay_out(layout)
+            slot, xy = self.layout.lay_out(layout)
         else:
             streams = [self._batched_episode_rng[env] for env in env_idx.tolist()]
             slot, xy, told = self._speaker.draw(streams, told)
@@ -227,6 +220,7 @@ class TouchEnv(RenderedEnv):
         self._success_once = self._success_once.index_fill(0, env_idx, False)
         self._wrong_once = self._wrong_once.index_fill(0, env_idx, False)
         self._stage = self._stage.index_fill(0, env_idx, 0)
+        self._stage_before = self._stage_before.index_fill(0, env_idx, 0)
         self._stepped = False
 
     def _resolve_goals(self) -> None:
@@ -338,6 +332,7 @@ class TouchEnv(RenderedEnv):
         return obs, reward, terminated.zero_(), truncated, info
 
     def _before_control_step(self) -> None:
+        self._stage_before = self._stage
         self._touch.clear()
 
     def _after_simulation_step(self) -> None:
@@ -355,9 +350,9 @@ class TouchEnv(RenderedEnv):
         Contacts are those of the last step; after a reset or a change of the state
         there are none until the next step.
         """
-        return Snapshot(*self._scene().values())
+        return Snapshot(*self._scene(self._stage).values())
 
-    def _scene(self) -> Snapshot:
+    def _scene(self, stage: Tensor) -> Snapshot:
         """Return a snapshot whose fields are partly read when they are first used.
 
         Use it within this step only: later the simulator would say something else.
@@ -371,31 +366,25 @@ class TouchEnv(RenderedEnv):
             velocity=later(lambda: table.velocities() / robot.scale),
             color=table.color,
             shape=table.shape,
-            stage=self._stage,
+            stage=stage,
         )
 
     def judged(self) -> Snapshot:
         """Return the snapshot that `evaluate` judged, at the stage it led to."""
         return self._judged.at_stage(self._stage)
 
-    def get_info(self) -> dict[str, Tensor]:
-        """Return what `evaluate` measures, and `elapsed_steps` since the reset [N]."""
-        info = super().get_info()
-        # On the CPU ManiSkill gives its own counter, which it goes on changing.
-        info["elapsed_steps"] = info["elapsed_steps"].clone()
-        return info
-
     def evaluate(self) -> dict[str, Tensor]:
         """Measure the goals; a step counts for the episode once, however often asked.
 
         Returns:
-            Per env [N]: `right_fingers` and `wrong_fingers` (int64): fingers that touch
-            as the goal asks, and as it does not allow; `success` (the goal holds),
-            `success_once` and `wrong_once` (so far in this episode; wrong is a foul),
-            `exclusive_success` (it has held, without any foul) as bool; `contact`
-            [N, F, C] bool; and in the dense reward modes `reward_terms` [N, K].
+            Per env [N]: `elapsed_steps` since the reset; `right_fingers` and
+            `wrong_fingers` (int64): fingers that touch as the goal asks, and as it does
+            not allow; `success` (the goal holds), `success_once` and `wrong_once` (so
+            far in this episode; wrong is a foul), `exclusive_success` (it has held,
+            without any foul) as bool; `contact` [N, F, C] bool; and in the dense reward
+            modes `reward_terms` [N, K].
         """
-        self._judged = scene = self._scene()
+        self._judged = scene = self._scene(self._stage_before)
         self.measure = self._goals.measure(scene)
         self.verdict = reward_generator.judge(scene, self.measure)
         if self._stepped:
@@ -404,6 +393,7 @@ class TouchEnv(RenderedEnv):
             self._success_once = self._success_once | self.measure.holds
             self._wrong_once = self._wrong_once | self.verdict.foul
         info = {
+            "elapsed_steps": self.elapsed_steps.clone(),  # ManiSkill's own goes on
             "contact": scene.contact,
             "right_fingers": self.verdict.right.sum(dim=1),
             "wrong_fingers": self.verdict.wrong.sum(dim=1),
@@ -491,7 +481,7 @@ class TouchEnv(RenderedEnv):
         self.instruction_index = task["instruction_index"][:, 0].long()
         self._restore_told(task["told"].byte())
         self.table.put(slice(None), task["slot"].long())
-        self._stage = task["stage"][:, 0].long()
+        self._stage_before = self._stage = task["stage"][:, 0].long()
         self._success_once = task["success_once"][:, 0].bool()
         self._wrong_once = task["wrong_once"][:, 0].bool()
         self._start = task["start"].view_as(self._start)
@@ -509,15 +499,11 @@ class TouchEnv(RenderedEnv):
 
     def set_state(self, state: Tensor, env_idx: Tensor | None = None) -> None:
         """Restore what `get_state` returned: the same, as one flat row per env."""
-        state = common.to_tensor(state, device=self.device)
-        widths = {name: leaf.shape[1] for name, leaf in self._task_state().items()}
-        tail = [len(self.agent.start_qpos), *widths.values()]
-        super().set_state(state[:, : -sum(tail)], env_idx)
-        target, *task = state[:, -sum(tail) :].split(tail, dim=1)
-        leaves = dict(zip(widths, task, strict=True))
-        self.set_state_dict(
-            {"controller": {"target_qpos": target}, "task": leaves}, env_idx
-        )
+        tree = self.get_state_dict()
+        sizes = [leaf.shape[1] for part in tree.values() for leaf in part.values()]
+        leaves = iter(common.to_tensor(state, device=self.device).split(sizes, dim=1))
+        given = {kind: {name: next(leaves) for name in tree[kind]} for kind in tree}
+        self.set_state_dict(given, env_idx)
 
 
 def _require_one_on_cpu(kwargs: dict[str, Any]) -> None:

@@ -22,7 +22,6 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ir_maniskill.checks import require_whole
-from ir_maniskill.environment.layout import layout_of
 from ir_maniskill.environment.robots import Nao
 from ir_maniskill.environment.senses import (
     TEXT_BYTES,
@@ -361,7 +360,7 @@ def _sentences(envs: GpuVectorEnv, seed: int) -> list[Instruction]:
     assert isinstance(task.instructions, Spoken)
     scene = _scene(envs, seed, None)
     there = things(envs.base_env.snapshot())[0]
-    allows = layout_of(task, envs.base_env.agent).allows(there)
+    allows = envs.base_env.layout.allows(there)
     for number in range(3 * SENTENCES):
         rng = Random(number)
         goal = draw(there, task.instructions.kinds, rng, allows=allows)

@@ -21,6 +21,7 @@ from mani_skill.utils.structs import Articulation
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ir_maniskill.environment.layout import BEHIND
 from ir_maniskill.environment.robots.robot import Robot
 from ir_maniskill.environment.table_scene import OBJECT_HEIGHT, TABLE_TOP
 from ir_maniskill.experiment import OBJECT_SIZE
@@ -56,8 +57,6 @@ LIFT = 2
 """Steps of raising the hand straight up before it goes anywhere."""
 RAISED = np.array([0, 0, 0.05])
 """Where it is raised to, and waits if it has nothing to do, above its start [m]."""
-BEHIND = 0.036
-"""How far behind an object's center a push begins [m]."""
 LOW = TABLE_TOP + 0.03
 """Height of the fingertips when they push [m]."""
 PASSED = 0.004

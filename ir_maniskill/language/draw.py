@@ -15,15 +15,18 @@ from typing import NamedTuple, TypeVar
 from ir_maniskill.goals import (
     COLORS,
     EXTREMES,
+    FIXED,
     RELATIONS,
     SHAPES,
     Avoid,
     Both,
     Goal,
     GoalError,
+    Push,
     Ref,
     Relation,
     Then,
+    Touch,
 )
 from ir_maniskill.language.splits import (
     HELD_OBJECTS,
@@ -32,15 +35,13 @@ from ir_maniskill.language.splits import (
     TEAMS,
     VERBS,
     Name,
-    act,
-    can,
     status,
 )
 from ir_maniskill.snapshot import Snapshot
 
 T = TypeVar("T")
-Where = str | tuple[str, Name] | None
-"""An extreme, or a relation and the other object."""
+Where = str | Relation | None
+"""An extreme, or a relation to another object."""
 Found = tuple[Name, Where, int]
 """An object: its description, and its place in the scene."""
 Act = tuple[str, Name, Where, int]
@@ -126,7 +127,7 @@ class _Scene:
             for verb in verbs
             # In other splits, the sentence must name what is new.
             if status(verb, color, shape) == split == status(verb, *name)
-            and can(verb, (color, shape))
+            and not (verb in VERBS["push"] and shape in FIXED)
             and (not alone or self.allows([(verb, index)]))
         ]
 
@@ -149,13 +150,14 @@ class _Scene:
                 yield name, relation, first
 
     def _beside(self, relation: str, landmark: Name, at: int) -> Iterator[Found]:
+        where = Relation(relation, Ref(*landmark))
         sure, perhaps = self._side(relation, at)
         for name, group in self.groups.items():
             fits = [index for index in group if index in perhaps]
             if len(fits) != 1 or fits[0] not in sure:
                 continue
             if relation != "other_than" or at in group:
-                yield name, (relation, landmark), fits[0]
+                yield name, where, fits[0]
 
     def _side(self, relation: str, at: int) -> tuple[set[int], set[int]]:
         """Return who is surely on a side of an object, and who perhaps."""
@@ -214,9 +216,9 @@ def _pick(options: Sequence[T], rng: Random) -> T:
 
 def _goal(found: Act) -> Goal:
     verb, name, where, _ = found
-    if isinstance(where, tuple):
-        return act(verb, name, Relation(where[0], Ref(*where[1])))
-    return act(verb, name, where)
+    first, _, last = verb.partition(" ")
+    ref = Ref(*name, where)
+    return Push(ref, last) if first == "push" else Touch(ref, first if last else None)
 
 
 def _one(view: _Scene, rng: Random, verbs: Sequence[str]) -> Goal | None:

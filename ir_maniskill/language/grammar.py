@@ -17,9 +17,7 @@ from random import Random
 from typing import Any
 
 from ir_maniskill.goals import (
-    COLORS,
     EXTREMES,
-    SHAPES,
     Avoid,
     Both,
     Goal,
@@ -83,16 +81,14 @@ def _phrase(text: str, mark: str, key: str | None) -> Phrase:
 
 
 def _load_rules() -> dict[str, tuple[Phrase, ...]]:
-    """Return all phrases by symbol, less the colors and shapes that there are not."""
+    """Return all phrases by symbol."""
     data = load_json("grammar.json")
-    exist: dict[str, Any] = {"color": COLORS, "shape": SHAPES}
     rules = {}
     for symbol, entry in {**data["templates"], **data["words"]}.items():
         by_key = {None: entry} if entry.keys() <= set(MARKS) else entry
         rules[symbol] = tuple(
             _phrase(text, mark, key)
             for key, marks in by_key.items()
-            if key in exist.get(symbol, by_key)
             for mark, texts in marks.items()
             for text in texts
         )

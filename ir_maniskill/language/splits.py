@@ -10,7 +10,6 @@ from functools import cache
 from random import Random
 
 from ir_maniskill.goals import (
-    FIXED,
     Avoid,
     Both,
     Goal,
@@ -22,7 +21,7 @@ from ir_maniskill.goals import (
     Touch,
 )
 from ir_maniskill.language.grammar import load_json, parse, words_by_mark
-from ir_maniskill.language.tokens import split_words, words_of
+from ir_maniskill.language.tokens import split_words
 
 Name = tuple[str | None, str | None]
 
@@ -58,18 +57,6 @@ def status(verb: str, color: str | None, shape: str | None) -> str | None:
     if objects and pairs:
         return None
     return "objects" if objects else "pairs" if pairs else "train"
-
-
-def act(verb: str, name: Name, where: str | Relation | None = None) -> Touch | Push:
-    """Return the goal of doing one of `VERBS` to an object."""
-    first, _, last = verb.partition(" ")
-    ref = Ref(*name, where)
-    return Push(ref, last) if first == "push" else Touch(ref, first if last else None)
-
-
-def can(verb: str, name: Name) -> bool:
-    """Return whether a verb can be done to an object so described."""
-    return not (verb in VERBS["push"] and name[1] in FIXED)
 
 
 def split_of(goal: Goal) -> str | None:
@@ -170,9 +157,6 @@ def handwritten() -> tuple[Instruction, ...]:
 
 
 @cache
-def words(split: str = "train") -> tuple[str, ...]:
-    """Return `<pad>`, `<unk>`, and all words that the sentences of a split may have."""
-    if split != "wording":
-        return words_by_mark("train")
-    texts = words_of(instruction.text for instruction in handwritten())
-    return tuple(dict.fromkeys((*words_by_mark("train", "wording"), *texts)))
+def words() -> tuple[str, ...]:
+    """Return `<pad>`, `<unk>`, and all words that training's sentences may have."""
+    return words_by_mark("train")

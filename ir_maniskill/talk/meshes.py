@@ -41,15 +41,10 @@ def _mesh(
     part: sapien.render.RenderShapeTriangleMeshPart, scale: np.ndarray
 ) -> trimesh.Trimesh:
     vertices, faces = part.vertices * scale, part.triangles
-    material = _material(part.material)
-    if len(faces) > FINEST:
-        vertices, faces = coarser(vertices, faces)
-        visual = TextureVisuals(material=material)
-        return trimesh.Trimesh(vertices, faces, visual=visual, process=False)
-    normals, visual = (
-        part.get_vertex_normal(),
-        TextureVisuals(part.get_vertex_uv(), material),
-    )
+    uv, normals = part.get_vertex_uv(), part.get_vertex_normal()
+    if len(faces) > FINEST:  # what is merged has neither
+        (vertices, faces), uv, normals = coarser(vertices, faces), None, None
+    visual = TextureVisuals(uv, _material(part.material))
     return trimesh.Trimesh(
         vertices, faces, vertex_normals=normals, visual=visual, process=False
     )

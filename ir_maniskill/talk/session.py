@@ -20,11 +20,9 @@ from mani_skill.utils.structs import Actor
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.checks import require_choice
-from ir_maniskill.environment.layout import layout_of
 from ir_maniskill.environment.robots.nao import Nao
 from ir_maniskill.environment.robots.robot import available_robots, short_name
 from ir_maniskill.environment.senses import cameras
-from ir_maniskill.environment.table_scene import OBJECT_HEIGHT, TABLE_TOP
 from ir_maniskill.experiment import OBJECT_SIZE, TABLE, Spoken
 from ir_maniskill.goals import GoalError, Instruction
 from ir_maniskill.language import draw, say, things
@@ -146,7 +144,7 @@ class Session:
             fits(catalog.get(task), robot, any_task=True)
         players = fitting(task, robot, checkpoint)
         self.seed = seed - 1
-        self._enter(Choice(task, robot, players[0] if policy else RANDOM))
+        self._enter(Choice(task, short_name(robot), players[0] if policy else RANDOM))
 
     def close(self) -> None:
         """Close all scenes."""
@@ -253,7 +251,7 @@ class Session:
             more = (f"please tap the {color} one", "Touch the leftmost one.")
             return [*[i.text for i in known[:5]], *more]
         (here,) = things(replace(self.scene, start=self.scene.pose))
-        allows = layout_of(self.env.experiment, self.env.agent).allows(here)
+        allows = self.env.layout.allows(here)
         found, rng = [], Random(self.seed)
         for kind in self.env.experiment.instructions.kinds:
             with suppress(GoalError):  # of some scenes there is little to say
@@ -306,8 +304,8 @@ class Session:
         """Put the held object where it is held, at rest on the table."""
         assert self.held is not None
         index, x, y = self.held
-        shape = self.names[index].split()[1]
-        z = self.env.agent.scale * (TABLE_TOP + OBJECT_HEIGHT[shape] / 2)
+        table = self.env.table
+        z = float(table.z[table.slot[0, index]])
         thing = self.thing(index)
         thing.set_pose(sapien.Pose([x, y, z]))
         if thing.px_body_type == "dynamic":

@@ -61,7 +61,7 @@ class Stored:
     tensors: dict[str, Tensor]
     """Tensors by name."""
     metadata: dict[str, Any]
-    """Plain data: config, spec, task, steps, figures, random states."""
+    """Plain data: config, spec, task, steps, figures."""
 
 
 # -- Files -----------------------------------------------------------------------------

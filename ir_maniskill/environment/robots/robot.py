@@ -322,8 +322,8 @@ def available_robots() -> dict[str, type[Robot]]:
     return {uid: cls for uid, cls in agents.items() if issubclass(cls, Robot)}
 
 
-def find_robot(robot: str | type[BaseAgent]) -> str | type[Robot]:
-    """Return what ManiSkill is to be asked for: a registered uid, or a class.
+def robot_class(robot: str | type[BaseAgent]) -> type[Robot]:
+    """Return the class of a robot.
 
     Args:
         robot: A subclass of `Robot`, the uid of a registered one, or its short name:
@@ -337,17 +337,11 @@ def find_robot(robot: str | type[BaseAgent]) -> str | type[Robot]:
     uids = available_robots()
     for uid in sorted(uids, key=lambda uid: uid != robot):  # its own uid comes first
         if robot in (uid, short_name(uid)):
-            return uid
+            return uids[uid]
     raise RobotError(
         f"robot_uids: got {robot!r}, expected a subclass of Robot or the name of a "
         f"registered one, available: {', '.join(map(short_name, uids))}"
     )
-
-
-def robot_class(robot: str | type[BaseAgent]) -> type[Robot]:
-    """Return the class of a robot; arguments and errors are those of `find_robot`."""
-    found = find_robot(robot)
-    return available_robots()[found] if isinstance(found, str) else found
 
 
 OURS = "ir_"

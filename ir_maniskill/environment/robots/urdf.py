@@ -66,10 +66,6 @@ class Motor:
 
     slides: bool
     """Whether the joint is prismatic."""
-    lower: float
-    """Least position [rad], of a slide [m]."""
-    upper: float
-    """Greatest position [rad], of a slide [m]."""
     effort: float
     """Largest torque [N m], of a slide force [N]."""
     velocity: float
@@ -114,9 +110,9 @@ def read_motor(joint: Element) -> Motor:
     except (KeyError, ValueError):
         numbers = [math.nan]
     if kind in ("revolute", "prismatic") and all(map(math.isfinite, numbers)):
-        motor = Motor(kind == "prismatic", *numbers)
-        if motor.lower < motor.upper and motor.effort > 0 and motor.velocity > 0:
-            return motor
+        lower, upper, effort, velocity = numbers
+        if lower < upper and effort > 0 and velocity > 0:
+            return Motor(kind == "prismatic", effort, velocity)
     shown = " ".join(f'{name}="{value}"' for name, value in given.items())
     raise RobotError(
         f"got type {kind!r} with <limit {shown}/>, expected a driven joint to be "
