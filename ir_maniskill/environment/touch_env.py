@@ -94,7 +94,7 @@ class TouchEnv(RenderedEnv):
         """Build the env.
 
         Args:
-            experiment: Its id.
+            experiment: The id of the experiment.
             robot_uids: Which robot: "nao", "g1", "panda", the uid of another that is
                 registered, or a subclass of `Robot`.
             render_backend: As for `BaseEnv`; "auto" is a CUDA device where there is
