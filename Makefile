@@ -13,7 +13,7 @@ BIN         := $(VENV)/bin
 IR          := $(BIN)/ir-maniskill
 PACKAGES    := $(VENV)/.stamp-packages
 VULKAN      := $(VENV)/.stamp-vulkan
-SOURCES     := ir_maniskill ir_maniskill_cli.py tasks assets tests examples scripts docs
+SOURCES     := ir_maniskill ir_maniskill_cli.py tasks assets tests examples scripts docs/make_images.py
 PYTEST      := $(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 
 export TORCH_INDEX
