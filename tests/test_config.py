@@ -27,6 +27,11 @@ def test_configs_survive_json(name):
     assert through_json(CONFIGS[name]) == CONFIGS[name]
 
 
+def test_a_budget_scales_all_that_follows_the_steps():
+    for config in CONFIGS.values():
+        dataclasses.replace(config, total_steps=6000)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

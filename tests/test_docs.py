@@ -70,6 +70,10 @@ def test_the_code_of_short_pages_runs(tmp_path: Path) -> None:
         run(tmp_path, "-c", here + other.replace("20_000", "110"))
 
 
+def test_the_readme_is_short() -> None:
+    assert len(README.read_bytes()) <= 9000
+
+
 # -- The tutorial ----------------------------------------------------------------------
 
 TUTORIAL = (ROOT / "docs" / "tutorial.md").read_text()

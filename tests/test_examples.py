@@ -1,5 +1,6 @@
 """Every example runs as a user would run it."""
 
+import json
 import os
 import re
 import subprocess
@@ -141,3 +142,10 @@ def test_the_notebook_runs(tmp_path: Path) -> None:
     assert shown == ["Image", "Image", "NoneType", "Video", "NoneType", "Image"]
     assert out.count("touched: True, and nothing else: True") == 3
     assert "The best policy, of step" in out
+
+
+def test_the_notebook_is_small_and_has_no_outputs() -> None:
+    text = (EXAMPLES / "quickstart.ipynb").read_text()
+    cells = json.loads(text)["cells"]
+    assert len(text) < 10_000
+    assert all(cell.get("outputs", []) == [] for cell in cells)

@@ -31,7 +31,7 @@ from ir_maniskill.training.config import (
     AgentConfig,
     ConfigError,
     TrainConfig,
-    to_data,
+    from_data,
 )
 from ir_maniskill.training.finite import TrainingDivergedError
 from ir_maniskill.training.run_folder import RunFolder
@@ -187,6 +187,16 @@ def test_an_evaluation_that_is_interrupted_is_made_on_resuming(
     assert_same(tensors(tmp_path / "whole"), tensors(tmp_path / "parts"))
 
 
+def test_a_run_that_began_with_a_policys_words_keeps_them(tmp_path, monkeypatch):
+    begun = toy_config(tmp_path, init_from="NaoInstruct-v1")
+    words = {"language": "lexicon", "vocabulary": (*VOCABULARY, "grape")}
+    agent = dataclasses.replace(begun.agent, **words)
+    begun = dataclasses.replace(begun, agent=agent)
+    monkeypatch.setattr(training, "stored_config", lambda out: begun)
+    monkeypatch.setattr(training, "run", lambda config, *_: config)
+    assert train("Toy-v1", True, ToyVectorEnv(), out=tmp_path) == begun
+
+
 def test_a_folder_may_be_a_path(tmp_path, monkeypatch):
     monkeypatch.setattr(training, "run", lambda config, *_: config)
     assert training.train("NaoTouchCubeSingle-v1", out=tmp_path).out == str(tmp_path)
@@ -241,9 +251,8 @@ def test_a_run_goes_on_with_its_own_config_but_for_what_is_given(tmp_path):
     stored = checkpoint.read(tmp_path / "last.safetensors")
     assert stored.metadata["steps"] == 2 * UPDATE
     longer = dataclasses.replace(config, total_steps=2 * UPDATE)
-    assert (tmp_path / "config.json").read_text() == json.dumps(
-        to_data(longer), indent=2
-    ) + "\n"
+    written = json.loads((tmp_path / "config.json").read_text())
+    assert from_data(written) == longer
 
 
 def test_a_run_that_ends_while_another_waits_for_its_folder_is_not_overwritten(
