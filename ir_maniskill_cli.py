@@ -17,6 +17,7 @@ A robot learns by reward alone to do what a sentence says.
   evaluate   play seeded episodes, and count
   audit      ask whether a policy looks, reads, and copes with what is new
   video      film a policy (.mp4 or .gif)
+  record     keep episodes of a policy as a dataset (ManiSkill, LeRobot)
   talk       open a page to talk to a robot, live
   curve      draw the learning curve of a run (.png)
   bench      measure how fast everything is on this machine

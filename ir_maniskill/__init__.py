@@ -8,12 +8,13 @@ Importing this package registers the robots and every task id, and does nothing 
     evaluate       play seeded episodes, and count
     audit          ask whether a policy looks and reads
     record         film a policy
+    collect        keep episodes of a policy, for others to learn from
     Experiment     what a task is; `register` makes one known to `gym.make`
     Goal           what a sentence asks for: `Touch`, `Push`, ... or a verb of your own
 """
 
 import ir_maniskill.tasks  # noqa: F401 - registers the tasks
-from ir_maniskill.api import audit, evaluate, record
+from ir_maniskill.api import audit, collect, evaluate, record
 from ir_maniskill.environment.vector import make_vec
 from ir_maniskill.experiment import (
     Experiment,
@@ -42,6 +43,7 @@ __all__ = [
     "TouchObject",
     "audit",
     "available",
+    "collect",
     "evaluate",
     "load_policy",
     "make_vec",

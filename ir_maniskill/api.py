@@ -1,4 +1,4 @@
-"""What to do with a trained policy, in one call each: evaluate, audit, film it."""
+"""What to do with a trained policy: evaluate, audit, film, or collect its episodes."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from collections.abc import Callable
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 
 from ir_maniskill import experiment as catalog
-from ir_maniskill.checks import require, require_whole
+from ir_maniskill.checks import require, require_choice, require_whole
 from ir_maniskill.environment.arguments import SEEDS
 from ir_maniskill.environment.vector import make_vec
 from ir_maniskill.evaluation import audit as audits
-from ir_maniskill.evaluation import video
+from ir_maniskill.evaluation import dataset, video
 from ir_maniskill.evaluation.evaluate import (
     EVALUATION_SEED,
     EvaluationReport,
@@ -181,6 +181,51 @@ def record(
     total = episodes * (experiment.episode_steps + 1)
     video.write_video(path, steps, speed=speed, total=total)
     return path
+
+
+def collect(
+    policy: PolicyLike,
+    folder: Path | str,
+    task: str | None = None,
+    *,
+    form: dataset.Format = "maniskill",
+    episodes: int = 100,
+    seed: int = dataset.DATASET_SEED,
+    height: int = 256,
+    failures: bool = False,
+    instruction: str | None = None,
+    any_task: bool = False,
+    progress: bool = True,
+    **env_kwargs: Any,
+) -> int:
+    """Play episodes and keep them for others to learn from; return how many were kept.
+
+    What it takes and raises is what `evaluate` does, and: `folder` is where to write, a
+    new folder or an empty one; `form` is "maniskill" for trajectories (.h5 and .json)
+    or "lerobot" for a LeRobotDataset. Pictures of the former are those that the policy
+    sees, those of the latter have `height` pixels, twice their width. `failures` keeps
+    all episodes, not only those with success and no foul.
+
+    Raises:
+        ConfigError: The folder is not empty, or "lerobot" lacks a package.
+    """
+    require_choice("form", form, get_args(dataset.Format))
+    require_whole("height", height, 2)
+    policy, experiment, chosen = _prepare(
+        policy, task, any_task, episodes, seed, instruction, env_kwargs
+    )
+    kwargs = {**policy.env_kwargs, **env_kwargs}
+    with closing(
+        dataset.open_writer(form, Path(folder), experiment.id, height, kwargs)
+    ) as writer:
+        return dataset.play(
+            policy,
+            writer,
+            choose_instructions(experiment, chosen),
+            range(seed, seed + episodes),
+            failures=failures,
+            progress=progress,
+        )
 
 
 def _prepare(

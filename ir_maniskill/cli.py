@@ -23,7 +23,7 @@ from ir_maniskill import api, bench, doctor
 from ir_maniskill import experiment as catalog
 from ir_maniskill.checks import ConfigError, require
 from ir_maniskill.environment.robots.robot import Robot, available_robots, short_name
-from ir_maniskill.evaluation import plots, video
+from ir_maniskill.evaluation import dataset, plots, video
 from ir_maniskill.evaluation.evaluate import EVALUATION_SEED, write_report
 from ir_maniskill.experiment import Drawn, Experiment, Spoken
 from ir_maniskill.files import require_writable, write_json
@@ -245,6 +245,37 @@ class Video(_Play):
 
 
 @dataclasses.dataclass(frozen=True)
+class Record(_Play):
+    """Record episodes of a policy, for others to learn from."""
+
+    seed: int = dataset.DATASET_SEED
+    """Seed of the first episode; episode e starts from seed + e."""
+    instruction: str | None = None
+    """Play this sentence only; None: all of the task's."""
+    format: dataset.Format = "maniskill"
+    """Trajectories that ManiSkill replays (.h5), or a LeRobotDataset."""
+    out: Path | None = None
+    """Folder to write to, new or empty; None: runs/ID-FORMAT."""
+    episodes: int = 100
+    """Episodes to play."""
+    failures: bool = False
+    """Keep those without success, or with a foul, too."""
+    height: int = 256
+    """Of a LeRobotDataset's pictures, twice their width [pixel]."""
+
+    def run(self) -> None:
+        """Play and keep."""
+        task = catalog.get(self.env_id).id
+        out = self.out or Path("runs") / f"{task}-{self.format}"
+        more = ("instruction", "episodes", "failures", "height")
+        options = self.options(*more)
+        kept = api.collect(self.policy_file(), out, task, form=self.format, **options)
+        print(f"{kept} of {self.episodes} episodes are in {out}.")
+        if kept < self.episodes:
+            print("The others missed the goal, or had a foul; --failures keeps all.")
+
+
+@dataclasses.dataclass(frozen=True)
 class Talk:
     """Open a page to talk to a robot: type a sentence, watch it do as told."""
 
@@ -422,6 +453,7 @@ def _parse(arguments: Sequence[str], defaults: TrainConfig) -> Any:
         | Evaluate
         | Audit
         | Video
+        | Record
         | Talk
         | Curve
         | Bench

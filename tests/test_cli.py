@@ -54,13 +54,13 @@ def test_tasks_lists_all_eight_ids_and_three_robots(capsys):
     assert ["g1", "ir_g1", "24"] in [row[:3] for row in rows]
 
 
-@pytest.mark.parametrize("command", ["train", "evaluate", "video"])
+@pytest.mark.parametrize("command", ["train", "evaluate", "video", "record"])
 def test_an_unknown_id_lists_those_there_are(command, capsys):
     line = fails(capsys, command, "NaoTouchMoon-v1")
     assert "got 'NaoTouchMoon-v1'" in line and all(name in line for name in IDS)
 
 
-@pytest.mark.parametrize("command", ["evaluate", "video"])
+@pytest.mark.parametrize("command", ["evaluate", "video", "record"])
 def test_a_policy_of_another_task_is_refused(command, policy_file, capsys):
     line = fails(capsys, command, IDS[5], "--checkpoint", str(policy_file))
     assert f"task: got '{IDS[0]}', expected '{IDS[5]}'" in line
@@ -97,6 +97,9 @@ def test_without_a_policy_the_error_tells_how_to_train(monkeypatch, tmp_path, ca
         (["video", IDS[0], "--episodes", "-1"], "episodes: got -1"),
         (["video", IDS[0], "--speed", "0"], "speed: got 0"),
         (["video", IDS[0], "--out", "film.avi"], "film.avi"),
+        (["record", IDS[0], "--out", "/dev"], "got '/dev', expected a new one"),
+        (["record", IDS[0], "--out", "/dev/null/x"], "cannot write /dev/null/x/"),
+        (["record", IDS[0], "--height", "1"], "height: got 1"),
         (["audit", IDS[0], "--picture", "bars"], "got bars, expected a name ending"),
         (["audit", IDS[0], "--policy", "a:b", "--checkpoint", "c"], "got 'a:b and c'"),
         (["video", IDS[0], "--seed", str(2**32 - 2)], "seed: got 4294967294"),
@@ -112,7 +115,7 @@ def test_without_a_policy_the_error_tells_how_to_train(monkeypatch, tmp_path, ca
     ],
 )
 def test_values_out_of_range_are_refused(arguments, message, capsys, policy_file):
-    if arguments[0] in ("evaluate", "video"):
+    if arguments[0] in ("evaluate", "video", "record"):
         arguments = [*arguments, "--checkpoint", str(policy_file)]
     assert message in fails(capsys, *arguments)
 
