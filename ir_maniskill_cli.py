@@ -10,7 +10,7 @@ from collections.abc import Sequence
 OVERVIEW = """\
 usage: ir-maniskill COMMAND ...
 
-A robot learns by reward alone to do what a sentence says.
+A robot learns to do what a sentence says.
 
   tasks      list the tasks, and the robots that can do them
   train      train an agent
@@ -19,7 +19,7 @@ A robot learns by reward alone to do what a sentence says.
   video      film a policy (.mp4 or .gif)
   record     keep episodes of a policy as a dataset (ManiSkill, LeRobot)
   talk       open a page to talk to a robot, live
-  curve      draw the learning curve of a run (.png)
+  curve      draw the learning curve of a run (.png, .pdf, .svg)
   bench      measure how fast everything is on this machine
   doctor     say whether this machine can render, and what to install if not
 
@@ -51,7 +51,7 @@ Train an agent. Ctrl-C is safe: --resume goes on from there.
   --robot NAME        nao, g1 or panda (nao)
   --agent.senses A B  what the actor perceives beside the sentence: vision,
                       proprioception, target, touch, state (the preset's)
-  --eval-interval N   steps from one evaluation to the next (20000)
+  --eval-interval N   steps from one evaluation to the next (the preset's)
   --sim-backend NAME  physx_cpu (a process a core), or physx_cuda (the GPU)
 
   --help-all          all options: rewards, cameras, network, algorithm

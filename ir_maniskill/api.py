@@ -99,7 +99,7 @@ def audit(
     from what a vector env observes to actions [N, J] in [-1, 1], or have such a method
     `act` and, if it remembers anything, `reset(done)`. What it has as `env_kwargs` goes
     to `make_vec`; without, it sees pictures and its actions change the joints' targets.
-    `episodes` are those of each row, `num_envs` at least 2, and all splits are played.
+    `episodes` are those of each control and split, `num_envs` at least 2, and all splits are played.
 
     Returns:
         The table: `print` shows it, `evaluation.plots.bars` draws it.

@@ -182,7 +182,7 @@ class Audit(_Play):
     policy: str | None = None
     """MODULE:FUNCTION from what a vector env observes to actions, to audit instead."""
     episodes: int = 200
-    """Episodes of each row of the table."""
+    """Episodes of each control and of each split."""
     num_envs: int = 8
     """Scenes simulated side by side."""
     json: Path | None = None
@@ -282,7 +282,8 @@ class Talk:
     env_id: TaskId = "NaoInstruct-v1"
     """Task whose scene it is; MODULE is imported first."""
     checkpoint: Path | None = None
-    """Policy or checkpoint file; None: one that ships with the package, if it fits."""
+    """Policy or checkpoint file, or the id of a task whose policy ships; None: one that
+    ships, if it fits."""
     policy: bool = True
     """Whether a policy moves the robot; --no-policy: random motion."""
     robot: str = "nao"

@@ -62,8 +62,8 @@ def test_the_code_of_short_pages_runs(tmp_path: Path) -> None:
     play, task, left_hand, other = blocks
     assert run(tmp_path, "-c", play).endswith("tensor([True])\n")
     run(tmp_path, "-c", left_hand)
-    (tmp_path / "fruit.py").write_text(task)
-    make = "import gymnasium as gym; gym.make('fruit:Fruit-v1', obs_mode='state')"
+    (tmp_path / "snack.py").write_text(task)
+    make = "import gymnasium as gym; gym.make('snack:Snack-v1', obs_mode='state')"
     run(tmp_path, "-c", make)
     if importlib.util.find_spec("stable_baselines3"):
         here = f"import sys; sys.path.append({str(ROOT)!r})\n"

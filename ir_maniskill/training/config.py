@@ -184,9 +184,9 @@ class TrainConfig:
     """How it learns: the paper's proximal policy optimization, or soft actor-critic
     with hindsight."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
-    """Of the former."""
+    """Numbers of "ppo"."""
     sac: SACConfig = field(default_factory=SACConfig)
-    """Of the latter."""
+    """Numbers of "sac"."""
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
