@@ -76,7 +76,7 @@ CURVES: dict[tuple[str, str], dict[str, Any]] = {
     ("listen", "Button"): {"color": "#f0c48a", "label": "listen (SAC), buttons"},
 }
 """Presets and shapes whose curves there are in `RUNS`, and how they are drawn."""
-FAILURE = (EVALUATION_SEED + 30, 2)
+FAILURE = (EVALUATION_SEED + 18, 1)
 """Seed and sentence of an episode in which the shipped policy touches a wrong cube."""
 
 

@@ -1,6 +1,7 @@
 """The shipped policies load, say how good they are, and are."""
 
 import json
+import runpy
 from contextlib import closing
 from importlib.resources import files
 from pathlib import Path
@@ -14,6 +15,7 @@ from ir_maniskill.evaluation.evaluate import Policy, Score, evaluate_policy
 from ir_maniskill.training.checkpoint import load_agent
 from ir_maniskill.training.config import TrainConfig
 
+DOCS = Path(__file__).parents[1] / "docs"
 SHIPPED = sorted(Path(str(files("ir_maniskill.assets"))).glob("policies/*.safetensors"))
 
 
@@ -45,7 +47,7 @@ def test_a_shipped_policy_says_where_it_comes_from(path: Path) -> None:
 
 @pytest.mark.parametrize("path", [p for p in SHIPPED if "Touch" in p.stem])
 def test_the_results_page_has_the_figures_of_a_shipped_policy(path: Path) -> None:
-    page = (Path(__file__).parents[1] / "docs" / "results.md").read_text()
+    page = (DOCS / "results.md").read_text()
     figures = json.loads(path.with_suffix(".json").read_text())
     for sentence, score in figures["instructions"].items():
         cells = [f"`{path.stem}`", sentence.split()[-2]]
@@ -65,6 +67,13 @@ def test_a_shipped_policy_does_what_it_is_told(path: Path) -> None:
     # None sweeps up whatever there is; in six episodes, two may fail that need not.
     assert score.exclusive.value >= told["exclusive"] - 0.35
     assert score.holding > told["exclusive"] - 0.4
+
+
+@pytest.mark.render
+def test_the_film_of_a_failure_shows_one() -> None:
+    film = runpy.run_path(str(DOCS / "make_images.py"))
+    *_, last = film["episode"](film["SHUFFLED"], film["FAILURE"][1], film["FAILURE"][0])
+    assert any(foul for _, foul in last.history)
 
 
 @pytest.mark.render
