@@ -25,6 +25,7 @@ from ir_maniskill.evaluation.evaluate import (
     player_of,
 )
 from ir_maniskill.experiment import Experiment
+from ir_maniskill.goals import Instruction
 from ir_maniskill.policy import Policy, load_policy
 
 PolicyLike = Policy | str | Path
@@ -38,7 +39,7 @@ def evaluate(
     episodes: int = 100,
     seed: int = EVALUATION_SEED,
     num_envs: int = 8,
-    instruction: str | None = None,
+    instruction: str | Instruction | None = None,
     any_task: bool = False,
     progress: bool = True,
     **env_kwargs: Any,
@@ -152,7 +153,7 @@ def record(
     episodes: int = 3,
     seed: int = EVALUATION_SEED,
     speed: float = 0.5,
-    instruction: str | None = None,
+    instruction: str | Instruction | None = None,
     any_task: bool = False,
 ) -> Path:
     """Film a policy, what it sees and what it feels (.mp4 or .gif); return the file.
@@ -193,7 +194,7 @@ def collect(
     seed: int = dataset.DATASET_SEED,
     height: int = 256,
     failures: bool = False,
-    instruction: str | None = None,
+    instruction: str | Instruction | None = None,
     any_task: bool = False,
     progress: bool = True,
     **env_kwargs: Any,
@@ -234,9 +235,9 @@ def _prepare(
     any_task: bool,
     episodes: int,
     seed: int,
-    instruction: str | None,
+    instruction: str | Instruction | None,
     env_kwargs: dict[str, Any],
-) -> tuple[Policy, Experiment, list[str] | None]:
+) -> tuple[Policy, Experiment, list[str | Instruction] | None]:
     """Check what is asked for; return the policy, the task and what to say."""
     require_whole("episodes", episodes, 1)
     require_whole("seed", seed, 0, SEEDS[-1] - 2 * episodes)  # the last ones'
