@@ -24,7 +24,7 @@ from ir_maniskill.evaluation.evaluate import (
     evaluate_policy,
     player_of,
 )
-from ir_maniskill.experiment import Experiment
+from ir_maniskill.experiment import Experiment, Spoken
 from ir_maniskill.goals import Instruction
 from ir_maniskill.policy import Policy, load_policy
 
@@ -100,7 +100,8 @@ def audit(
     from what a vector env observes to actions [N, J] in [-1, 1], or have such a method
     `act` and, if it remembers anything, `reset(done)`. What it has as `env_kwargs` goes
     to `make_vec`; without, it sees pictures and its actions change the joints' targets.
-    `episodes` are those of each control and split, `num_envs` at least 2, and all splits are played.
+    `episodes` are those of each control and split, `num_envs` at least 2. All splits
+    are played.
 
     Returns:
         The table: `print` shows it, `evaluation.plots.bars` draws it.
@@ -248,5 +249,8 @@ def _prepare(
     experiment = catalog.get(task or policy.env_id)
     policy.require_match(experiment, env_kwargs.get("robot_uids"), any_task=any_task)
     wanted = None if instruction is None else [instruction]
-    choose_instructions(experiment.in_split(env_kwargs.get("split") or "train"), wanted)
+    split = experiment.in_split(env_kwargs.get("split") or "train")
+    for said in choose_instructions(split, wanted):
+        if said is not None and not isinstance(experiment.instructions, Spoken):
+            experiment.check_refs(said)
     return policy, experiment, wanted

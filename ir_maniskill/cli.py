@@ -9,7 +9,6 @@ import logging
 import os
 import pkgutil
 import shlex
-import signal
 import sys
 import warnings
 from collections.abc import Sequence
@@ -36,7 +35,7 @@ from ir_maniskill.training.config import (
     TrainConfig,
     require_same,
 )
-from ir_maniskill.training.run_folder import stored_config
+from ir_maniskill.training.run_folder import interruptible, stored_config
 from ir_maniskill.training.train import beginning_with, for_experiment
 from ir_maniskill.training.train import run as train
 
@@ -376,15 +375,14 @@ def main(arguments: Sequence[str]) -> None:
     The code is 0 if all went well, 1 if the doctor found a fault, 2 for a request that
     cannot be carried out, and 130 after Ctrl-C, SIGTERM or a terminal that is closed.
     """
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) is signal.SIG_DFL:  # nohup has SIGHUP ignored
-            signal.signal(number, signal.default_int_handler)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal may know ASCII alone
             stream.reconfigure(errors="backslashreplace")
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     warnings.filterwarnings("ignore", module=r"(mani_skill|sapien|gymnasium)\b.*")
-    sys.exit(run(arguments))
+    with interruptible():
+        code = run(arguments)
+    sys.exit(code)
 
 
 def run(arguments: Sequence[str]) -> int:

@@ -215,6 +215,10 @@ class Jitter:
 RewardKind = Literal["binary", "per_finger"]
 
 
+class _Derived(tuple):
+    """A vocabulary that was derived, which `dataclasses.replace` derives anew."""
+
+
 @dataclass(frozen=True)
 class Experiment:
     """One experiment of the Environment block (paper, Sec. III-A and IV).
@@ -262,10 +266,10 @@ class Experiment:
             _require_tuple("objects", self.objects, TouchObject)
         if not isinstance(self.instructions, Spoken):
             _require_tuple("instructions", self.instructions, Instruction)
-        if self.vocabulary == ():
+        if self.vocabulary == () or isinstance(self.vocabulary, _Derived):
             spoken = isinstance(self.instructions, Spoken)
             words = words_of_language() if spoken else words_of(self.sentences)
-            object.__setattr__(self, "vocabulary", words)
+            object.__setattr__(self, "vocabulary", _Derived(words))
         self._check_vocabulary()
         for sentence in self.sentences:
             warn_of_unknown(sentence, self.vocabulary)
@@ -337,7 +341,7 @@ class Experiment:
         said: dict[tuple[int, ...], Instruction] = {}
         for instruction in self.instructions:
             text = instruction.text
-            self._check_refs(instruction)
+            self.check_refs(instruction)
             tokens = tuple(tokenize(text, self.vocabulary))
             _require(tokens != (), "instruction text", text, "a word or full stop")
             other = said.setdefault(tokens, instruction)
@@ -348,7 +352,7 @@ class Experiment:
                 "it to have the words that tell their goals apart",
             )
 
-    def _check_refs(self, instruction: Instruction) -> None:
+    def check_refs(self, instruction: Instruction) -> None:
         """Raise unless each reference fits one object, as far as the layout says."""
         layout = scene_of(Thing(o.color, o.shape, *o.position) for o in self.bodies)
         what, goal = f"instruction {instruction.text!r}", instruction.goal

@@ -32,7 +32,7 @@ import torch
 from torch import Tensor
 
 from ir_maniskill import checks
-from ir_maniskill.snapshot import Later, Lazy, Snapshot, later
+from ir_maniskill.snapshot import Lazy, Snapshot, later
 
 COLORS: dict[str, tuple[float, float, float]] = {
     "blue": (0.05, 0.16, 0.85),
@@ -196,17 +196,7 @@ class Measure(Lazy):
     """How many goals of a sequence `Then` are reached [N] int64; None: 0."""
 
     def __post_init__(self) -> None:
-        """Have what was left out come later.
-
-        Raises:
-            GoalError: `holds`, `gap` or `serves` has no such shape.
-        """
-        for name, dims in {"holds": 1, "gap": 1, "serves": 3}.items():
-            value = vars(self)[name]
-            if not isinstance(value, Later) and getattr(value, "ndim", -1) != dims:
-                got = getattr(value, "shape", repr(value))
-                expected = "a tensor [N]" if dims == 1 else "a tensor [N, F, C]"
-                raise GoalError(f"{name} of a Measure: got {got}, expected {expected}")
+        """Have what was left out come later."""
         defaults = {
             "bars": lambda: torch.zeros_like(self.serves),
             "level": lambda: self.holds.float(),
@@ -224,6 +214,27 @@ class Measure(Lazy):
     def _objects(self) -> Tensor:
         """Something of the objects' shape [N, C] bool."""
         return self.serves[:, 0]
+
+    def require_fit(self, scene: Snapshot) -> None:
+        """Raise GoalError unless all that is known already is what it should be."""
+        n, f, c = scene.contact.shape
+        truth, number, count = torch.bool, torch.float32, torch.int64
+        kinds = {
+            **{"holds": (truth, n), "gap": (number, n), "serves": (truth, n, f, c)},
+            **{"bars": (truth, n, f, c), "level": (number, n), "still": (truth, n, c)},
+            **{
+                "may_move": (truth, n, c),
+                "aim": (number, n, c, 3),
+                "stage": (count, n),
+            },
+        }
+        for name, (dtype, *shape) in kinds.items():
+            value = vars(self).get(name)  # none if it comes later
+            got = [getattr(value, "dtype", None), *getattr(value, "shape", ())]
+            if value is not None and got != [dtype, *shape]:
+                told = repr(value) if got == [None] else f"{got[0]} {got[1:]}"
+                expected = f"{dtype} {shape} (N, F, C = {n}, {f}, {c})"
+                raise GoalError(f"{name} of a Measure: got {told}, expected {expected}")
 
     def has(self, name: str) -> bool:
         """Return whether a field was given, not left out."""

@@ -80,6 +80,28 @@ def test_encoders_are_known_by_name():
         language(language="gpt")
     with pytest.raises(ConfigError, match="got 'tokens', expected one that is not tak"):
         language_system.register("tokens", language_system.LexiconTransformer)
+    with pytest.raises(ConfigError, match="encoder 'three': got 3, expected a subcl"):
+        language_system.register("three", 3)
+
+
+def test_what_an_encoder_reads_and_returns_is_checked(monkeypatch):
+    monkeypatch.setattr(language_system, "_ENCODERS", {**language_system._ENCODERS})
+
+    class Short(language_system.LanguageEncoder):
+        width = 9
+        reads = "text"
+
+        def forward(self, ids):
+            return ids.float()[:, :1].repeat(1, 8)
+
+    with pytest.raises(ConfigError, match="reads .* 'short': got 'text', expected a t"):
+        language_system.register("short", Short)
+    Short.reads = ("instruction",)
+    language_system.register("short", Short)
+    state = make_state()
+    message = r"Short: got G_t \(4, 8\), expected \(4, 9\)"
+    with pytest.raises(ValueError, match=message):
+        make_agent(state, language="short").policy(state)
 
 
 def test_repeated_sentences_are_encoded_alike_and_share_their_gradient():

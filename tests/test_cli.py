@@ -94,6 +94,7 @@ def test_without_a_policy_the_error_tells_how_to_train(monkeypatch, tmp_path, ca
         (["evaluate", IDS[0], "--episodes", "0"], "episodes: got 0"),
         (["evaluate", IDS[0], "--split", "pairs"], "got 'pairs', expected 'train'"),
         (["evaluate", IDS[0], "--instruction", "Hop."], "'Touch the blue cube.'"),
+        (["evaluate", IDS[0], "--instruction", "Touch the can."], "exactly one of: "),
         (["video", IDS[0], "--episodes", "-1"], "episodes: got -1"),
         (["video", IDS[0], "--speed", "0"], "speed: got 0"),
         (["video", IDS[0], "--out", "film.avi"], "film.avi"),

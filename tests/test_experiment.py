@@ -200,3 +200,16 @@ def test_what_is_fixed_to_the_table_is_not_to_be_pushed() -> None:
     both = Instruction("Push green left, touch blue.", Both(push, Touch(Ref("blue"))))
     with pytest.raises(ExperimentError, match="it moves: got 'green button', expected"):
         make(objects=(BLUE, button), instructions=(both,))
+
+
+def test_a_vocabulary_that_was_derived_is_derived_anew_when_replaced() -> None:
+    single = catalog.get("NaoTouchCubeSingle-v1")
+    blue = Instruction("Grab the banana.", Touch(Ref("blue")))
+    derived = dataclasses.replace(single, vocabulary=())
+    assert "banana" not in derived.vocabulary
+    other = pickle.loads(
+        pickle.dumps(dataclasses.replace(derived, instructions=(blue,)))
+    )
+    assert {"grab", "banana"} <= {*other.vocabulary}
+    given = dataclasses.replace(single, instructions=(blue,), vocabulary=VOCABULARY)
+    assert given.vocabulary == VOCABULARY

@@ -297,9 +297,14 @@ def test_a_field_that_cannot_be_stacked_is_refused():
 @pytest.mark.parametrize(
     ("answer", "message"),
     [
-        ({"gap": 0}, r"gap of a Measure: got 0, expected a tensor \[N\]"),
-        ({"holds": torch.ones(1, 2)}, r"holds .* got torch.Size\(\[1, 2\]\), expected"),
-        ({"serves": torch.ones(1)}, r"serves .* expected a tensor \[N, F, C\]"),
+        ({"gap": 0}, r"gap of a Measure: got 0, expected torch.float32 \[1\]"),
+        ({"gap": torch.ones(1).double()}, r"gap .*: got torch.float64 \[1\], expected"),
+        ({"holds": torch.ones(1)}, r"holds .*: got torch.float32 \[1\], .*bool \[1\]"),
+        (
+            {"level": torch.ones(1, 1)},
+            r"level .*: got torch.float32 \[1, 1\], expected",
+        ),
+        ({"serves": torch.ones(1)}, r"serves .* \(N, F, C = 1, \d, \d\)"),
         (None, r"Hop.measure: got tensor\(.*, expected a Measure"),
     ],
 )

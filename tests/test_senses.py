@@ -178,6 +178,19 @@ def test_a_sense_of_ones_own_is_one_entry(own_senses) -> None:
         AgentConfig(senses=("touch", "clock"))
 
 
+@pytest.mark.parametrize("value", [3.0, torch.zeros(6), torch.zeros(2, 6)])
+def test_a_sense_without_a_row_for_each_env_is_refused(own_senses, value) -> None:
+    senses.register(Term("clock", "body", "1", lambda *_: value))
+    message = r"sense 'clock': got .*, expected a tensor \[N, 1\] with N = 1"
+    with pytest.raises(ValueError, match=message):
+        gym.make("NaoTouchCubeSingle-v1", obs_mode="state_dict", render_backend="none")
+
+
+def test_only_dicts_become_a_state() -> None:
+    with pytest.raises(ValueError, match="observation: got 'Tensor', expected a dict"):
+        flatten(torch.zeros(1, 100))  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(
     ("term", "message"),
     [

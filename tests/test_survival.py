@@ -136,6 +136,26 @@ def test_a_worker_that_dies_or_hangs_is_named_and_no_update_is_lost(
     assert not any(worker.is_running() for worker in workers)
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_script_that_is_asked_to_end_leaves_a_checkpoint(
+    tmp_path, before_update, number
+):
+    before = signal.getsignal(number)
+    before_update(3, lambda: signal.raise_signal(number))
+    with pytest.raises(KeyboardInterrupt):
+        run(toy_config(tmp_path), envs=ToyVectorEnv(8))
+    assert saved(tmp_path).metadata["steps"] == 2 * UPDATE
+    assert signal.getsignal(number) is before
+
+
+def test_a_run_that_fails_at_its_first_step_leaves_none(tmp_path):
+    envs, config = ToyVectorEnv(8), toy_config(tmp_path)
+    envs.step = lambda _: 1 / 0
+    with pytest.raises(ZeroDivisionError):
+        run(config, envs=envs)
+    run(config, envs=ToyVectorEnv(8), eval_envs=ToyVectorEnv(8))
+
+
 # -- Ctrl-C ----------------------------------------------------------------------------
 
 

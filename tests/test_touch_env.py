@@ -7,6 +7,7 @@ import subprocess
 import sys
 import textwrap
 from collections.abc import Iterator
+from contextlib import closing
 
 import gymnasium as gym
 import numpy as np
@@ -21,7 +22,7 @@ from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.robots.nao import JOINTS, Nao
 from ir_maniskill.environment.touch_env import CONTACT_OFFSET, TouchEnv
 from ir_maniskill.experiment import Jitter
-from ir_maniskill.goals import Instruction, Ref, Then, Touch
+from ir_maniskill.goals import GoalError, Instruction, Ref, Then, Touch
 
 IDS = ir_maniskill.available()[:8]
 QUICK = ("NaoTouchButtonMulti-v1", "NaoTouchCubeShuffled-v1")
@@ -427,9 +428,25 @@ def test_the_named_object_costs_by_its_own_speed() -> None:
 # -- At home in its ecosystem ---------------------------------------------------------
 
 
+def test_after_a_reset_that_failed_a_step_is_refused() -> None:
+    kwargs = {"obs_mode": "state", "render_backend": "none"}
+    with closing(gym.make("NaoTouchCubeSingle-v1", **kwargs)) as env:
+        with pytest.raises(GoalError, match="objects that fit"):
+            env.reset(options={"instruction": "Touch the purple cube."})
+        with pytest.raises(RuntimeError, match="the last reset failed; reset"):
+            env.step(env.action_space.sample())
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+    for use in (env.reset, lambda: env.step(None), lambda: env.unwrapped.tell(0)):
+        with pytest.raises(RuntimeError, match="this env is closed: make a new one"):
+            use()
+
+
 @pytest.mark.slow
-def test_gymnasiums_checker_accepts_the_cpu_wrapper() -> None:
-    env = gym.make("NaoTouchButtonSingle-v1", obs_mode="state", render_backend="none")
+@pytest.mark.render
+@pytest.mark.parametrize("obs_mode", ["state", "rgb"])
+def test_gymnasiums_checker_accepts_the_cpu_wrapper(obs_mode: str) -> None:
+    env = gym.make("NaoTouchButtonSingle-v1", obs_mode=obs_mode)
     # Left out: what makes the env anew from its spec, since ManiSkill's time limit
     # wrapper does not record its arguments.
     check_env(CPUGymWrapper(env), skip_render_check=True, skip_close_check=True)

@@ -229,7 +229,7 @@ def test_a_best_policy_that_is_broken_is_refused_before_training(tmp_path, inter
     with pytest.raises(KeyboardInterrupt):
         run(toy_config(tmp_path, eval_interval=UPDATE))
     (tmp_path / "best.safetensors").write_bytes(b"cut short")
-    with pytest.raises(CheckpointError, match="best.safetensors"):
+    with pytest.raises(CheckpointError, match="best.safetensors: .*or move it away"):
         run(toy_config(tmp_path), resume=True)
 
 
@@ -417,11 +417,29 @@ def test_a_folder_with_a_run_is_not_overwritten(tmp_path):
     [
         (ToyVectorEnv(4), "num_envs of those given: got 4, expected 8"),
         (ToyVectorEnv(8, env_id="B-v1"), "env_id: got 'Toy-v1', expected 'B-v1'"),
+        ({"robot_uids": "panda"}, "robot_uids of the envs given: got 'ir_panda', exp"),
+        ({"control_mode": "pd_joint_pos"}, "control_mode .*: got 'pd_joint_pos', exp"),
+        ({"reward_mode": "sparse"}, "reward_mode .*: got 'sparse', expected 'dense'"),
     ],
 )
 def test_envs_that_are_not_the_configs_are_refused(tmp_path, envs, message):
+    if isinstance(envs, dict):
+        kwargs, envs = envs, ToyVectorEnv(8)
+        envs.env_kwargs = {**envs.env_kwargs, **kwargs}
     with pytest.raises(ConfigError, match=message):
         training.run(toy_config(tmp_path), envs=envs)
+
+
+def test_the_algorithm_may_be_named(monkeypatch):
+    given = []
+    monkeypatch.setattr(training, "run", lambda *args: given.append(args))
+    training.train("NaoTouchCubeSingle-v1", preset="listen", algorithm="sac")
+    ((config, *_, algorithm),) = given
+    assert (config.algorithm, algorithm) == ("sac", None)
+    with pytest.raises(
+        ConfigError, match="algorithm: got 'dqn', expected one of 'ppo'"
+    ):
+        training.train("NaoTouchCubeSingle-v1", algorithm="dqn")
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,8 @@ from ir_maniskill.environment.process_vector import (
 )
 from ir_maniskill.environment.shared_rows import SharedRows, record_of, reserve
 from ir_maniskill.environment.vector import make_vec
+from ir_maniskill.experiment import Experiment, TouchObject
+from ir_maniskill.goals import Instruction, Ref, Touch
 
 TASK = "NaoTouchCubeTriangle-v1"
 SENTENCES = catalog.get(TASK).sentences
@@ -490,3 +492,14 @@ def test_a_batch_on_a_gpu_ends_episodes_alike(batch: Batch) -> None:
     assert info["final_obs"]["touch"].sum(1).tolist() == [0, 2, 0]
     assert info["_final_obs"].tolist() == [False, True, False]
     assert batch.resets == [(None, [1])]
+
+
+def test_a_goal_that_workers_cannot_import_is_told_of() -> None:
+    class Hover(Touch):
+        pass
+
+    blue = TouchObject("blue", (0.2, 0.0))
+    task = Experiment("Hover-v1", (blue,), (Instruction("Up.", Hover(Ref("blue"))),))
+    message = "Hover.*; worker processes import goals.* at the top level of a .py file"
+    with pytest.raises(WorkerError, match=message):
+        ProcessVectorEnv(task, 1)

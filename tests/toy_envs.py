@@ -63,6 +63,7 @@ class ToyVectorEnv:
     def __init__(self, num_envs=8, images=False, env_id="Toy-v1", snapshots=False):
         self.num_envs, self.images, self.snapshots = num_envs, images, snapshots
         self.device = torch.device("cpu")
+        self.env_kwargs = toy_config("").env_kwargs(training=True)
         self.single_action_space = Box(-1, 1, (JOINTS,))
         senses = ("vision", "proprioception") if images else ("proprioception",)
         self.experiment = SimpleNamespace(

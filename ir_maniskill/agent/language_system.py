@@ -50,8 +50,13 @@ def register(name: str, encoder: type[LanguageEncoder]) -> None:
     """Make an encoder known as a value of `AgentConfig.language`.
 
     Raises:
-        ConfigError: Another one has that name.
+        ConfigError: Another one has that name, or it is no such class.
     """
+    kind = isinstance(encoder, type) and issubclass(encoder, LanguageEncoder)
+    require(kind, f"encoder {name!r}", encoder, "a subclass of LanguageEncoder")
+    reads, two = encoder.reads, ("instruction", "text")
+    fits = isinstance(reads, tuple) and reads != () and set(reads) <= {*two}
+    require(fits, f"reads of the encoder {name!r}", reads, f"a tuple of some of {two}")
     free = _ENCODERS.setdefault(name, encoder) is encoder
     require(free, "name of a language encoder", name, "one that is not taken")
 

@@ -126,6 +126,7 @@ class GoalBatch:
 def _measured(kind: type[Goal], scene: Snapshot, asked: SimpleNamespace) -> Measure:
     measure = kind.measure(scene, asked)
     require_type(f"{kind.__name__}.measure", measure, Measure, GoalError)
+    measure.require_fit(scene)
     return measure
 
 

@@ -29,7 +29,7 @@ from ir_maniskill.environment.host_tensor import HostTensor
 from ir_maniskill.environment.robots import Nao
 from ir_maniskill.environment.robots.robot import robot_class
 from ir_maniskill.environment.shared_rows import SharedRows, Tree, map_leaves, reserve
-from ir_maniskill.environment.worker import ENDS, work
+from ir_maniskill.environment.worker import ENDS, IMPORTABLE, work
 from ir_maniskill.experiment import Experiment
 
 Observation = Any
@@ -72,6 +72,8 @@ class ProcessVectorEnv(VectorEnv):
         cores = len(os.sched_getaffinity(0))
         workers = min(num_envs, num_workers or cores)
         self.experiment, self.num_envs, self._timeout = experiment, num_envs, timeout
+        self.env_kwargs = env_kwargs or {}
+        """What the envs were made with."""
         self._rows = [r.tolist() for r in np.array_split(np.arange(num_envs), workers)]
         self._pipes: list[Connection] = []
         self._processes: list[mp.process.BaseProcess] = []
@@ -82,7 +84,7 @@ class ProcessVectorEnv(VectorEnv):
         try:
             _require_main()
             self._start()
-            self._make(env_kwargs or {})
+            self._make(self.env_kwargs)
         except BaseException:
             self.close()
             raise
@@ -240,7 +242,10 @@ class ProcessVectorEnv(VectorEnv):
 
     def _send(self, name: str, arguments: list) -> None:
         # Pickled here: `send` would pass each tensor as a file descriptor.
-        messages = [pickle.dumps((name, argument)) for argument in arguments]
+        try:
+            messages = [pickle.dumps((name, argument)) for argument in arguments]
+        except (AttributeError, pickle.PicklingError) as error:
+            raise WorkerError(f"{name}: {error}; {IMPORTABLE}") from error
         self._busy = True
         for index, message in enumerate(messages):
             try:

@@ -94,11 +94,14 @@ class RenderedEnv(BaseEnv):
         return {name: _fetch_color(sensor) for name, sensor in sensors}
 
     def get_sensor_params(self) -> dict:
-        """Return the cameras' matrices, computed once if no camera moves."""
+        """Return copies of the cameras' matrices, computed once if no camera moves."""
         moving = any(sensor.camera.mount for sensor in self._sensors.values())
         if self._sensor_params is None or moving:
             self._sensor_params = super().get_sensor_params()
-        return self._sensor_params
+        return {
+            name: {key: matrix.clone() for key, matrix in matrices.items()}
+            for name, matrices in self._sensor_params.items()
+        }
 
 
 def _fetch_color(sensor: Camera) -> dict[str, Tensor]:

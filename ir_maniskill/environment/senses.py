@@ -11,13 +11,14 @@ C objects, L tokens, B bytes, P privileged numbers.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+from ir_maniskill.checks import require
 from ir_maniskill.goals import GoalError
 from ir_maniskill.language.tokens import PAD, tokenize
 
@@ -185,13 +186,24 @@ def observe(env: Any, part: Part, info: Info) -> dict[str, Tensor]:
     """Return one part of an env's observation: what its terms measure."""
     mode = env.obs_mode_struct
     return {
-        term.name: term.measure(env, info)
+        term.name: _fitting(term, term.measure(env, info), env.num_envs)
         for term in _TERMS
         if term.part == part
         and term.measure is not None
         and (mode.use_state or term.encoder != "privileged")
         and (not term.asked or term.name in env.asked)
     }
+
+
+def _fitting(term: Term, value: Tensor, envs: int) -> Tensor:
+    """Return what a term measured; of one of a user's own, as floats [N, ...]."""
+    if term in _TERMS[:_OURS]:
+        return value
+    rows = isinstance(value, Tensor) and value.ndim > 1 and len(value) == envs
+    got = tuple(value.shape) if isinstance(value, Tensor) else value
+    expected = f"a tensor [N, {term.shape}] with N = {envs}"
+    require(rows, f"sense {term.name!r}", got, expected, ValueError)
+    return value.float()
 
 
 def entries(senses: Iterable[str]) -> dict[str, Encoder]:
@@ -248,7 +260,13 @@ def _padded(rows: list[list[int]], length: int, dtype: torch.dtype) -> Tensor:
 
 
 def flatten(obs: Observation) -> State:
-    """Return one observation o_t as a flat dict of the terms it has."""
+    """Return one observation o_t as a flat dict of the terms it has.
+
+    Raises:
+        ConfigError: It is no dict.
+    """
+    expected = "a dict of tensors: another obs_mode, such as 'rgb' or 'state_dict'"
+    require(isinstance(obs, Mapping), "observation", type(obs).__name__, expected)
     state, privileged = {}, []
     for term in _TERMS:
         value = term.find(obs)

@@ -122,6 +122,7 @@ class TouchEnv(RenderedEnv):
         self._reward_weights = RewardWeights().changed(reward_weights or {})
         self.asked = senses.require_askable(observe)
         self._stepped = False  # whether a step was made that is not judged yet
+        self._ready = self._closed = False  # for a step; for ever
         if render_backend == "auto":
             render_backend = "gpu" if torch.cuda.is_available() else "cpu"
         render_backend = render_backend or "none"
@@ -264,6 +265,7 @@ class TouchEnv(RenderedEnv):
             ValueError: A sentence means nothing that the task or the language knows.
             GoalError: It does not fit the scene, or is too long; nothing has changed.
         """
+        self._require_open()
         everyone = torch.arange(self.num_envs, device=self.device)
         told = instructions_of(said, self.experiment, self.num_envs)
         known, index = self._told(everyone, told)
@@ -316,8 +318,21 @@ class TouchEnv(RenderedEnv):
         seeds = None if seed is None else seeds_of(seed, self.num_envs)
         if seeds is not None and not self._sim_device.is_cuda():
             options.setdefault("reconfigure", True)
+        self._require_open()
+        self._ready = False
         gym.Env.reset(self, seed=None if seeds is None else seeds[0])
-        return super().reset(seeds, options)
+        begun = super().reset(seeds, options)
+        self._ready = True
+        return begun
+
+    def close(self) -> None:
+        """Let go of the scene; nothing can be done afterwards."""
+        self._closed = True
+        super().close()
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise RuntimeError("this env is closed: make a new one")
 
     def step(self, action: Any) -> tuple[Any, Tensor, Tensor, Tensor, dict]:
         """Step as ManiSkill does, except that success does not end the episode.
@@ -325,7 +340,11 @@ class TouchEnv(RenderedEnv):
         Raises:
             ValueError: The action has another shape, or is not finite (checked on the
                 CPU only).
+            RuntimeError: The env is closed, or the last reset failed.
         """
+        self._require_open()
+        if not self._ready:
+            raise RuntimeError("step: the last reset failed; reset the env again")
         if action is not None and not isinstance(action, dict):  # ManiSkill's matter
             action = action_of(action, (self.num_envs, *self.single_action_space.shape))
         obs, reward, terminated, truncated, info = super().step(action)

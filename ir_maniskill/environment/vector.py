@@ -82,6 +82,7 @@ class GpuVectorEnv(ManiSkillVectorEnv):
 
     def __init__(self, task_id: str, num_envs: int, **env_kwargs: Any) -> None:
         """Make the batched env; the arguments are those of `make_vec`."""
+        self.env_kwargs = env_kwargs
         env = gym.make(task_id, num_envs=num_envs, **env_kwargs)
         super().__init__(env, ignore_terminations=True)
         self.experiment = self.base_env.experiment

@@ -26,6 +26,13 @@ ENDS = ("terminated", "truncated")
 """How an episode can end, each a field of what is shared."""
 
 
+IMPORTABLE = (
+    "worker processes import goals, senses and robots of your own: define them at the "
+    "top level of a .py file"
+)
+"""What to do where one cannot be pickled."""
+
+
 def work(pipe: Connection, environ: dict[str, str]) -> None:
     """Run a worker: answer commands until the parent closes the pipe or is gone."""
     # The fork server still has the environment variables of when it was started.
@@ -119,6 +126,9 @@ class _Worker:
         """Return whether the command could be done, and its result or what failed."""
         try:
             name, argument = pickle.loads(message)
+        except (AttributeError, ImportError) as error:
+            return pickle.dumps((False, f"{error}; {IMPORTABLE}"))
+        try:
             return pickle.dumps((True, getattr(self, name)(argument)))
         except Exception:
             return pickle.dumps((False, traceback.format_exc()))

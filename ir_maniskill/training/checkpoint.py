@@ -192,7 +192,8 @@ def load_agent(path: Path | str) -> tuple[Agent, TrainConfig, dict[str, Any]]:
         raise CheckpointError(
             f"{path}, written by ir_maniskill {stored.metadata.get('version')}: its "
             "weights and its config do not belong together "
-            f"({shorten(str(error), 300)}); expected a file of this version"
+            f"({shorten(str(error), 300)}); expected a file of this version, and the "
+            "module to be imported that registers its language encoder and senses"
         ) from error
     return agent.eval(), config, stored.metadata
 

@@ -124,6 +124,11 @@ class RunFolder:
         steps = snapshot.metadata["steps"]
         log.warning("stopped at step %d: resume goes on there", steps)
 
+    def forget(self) -> None:
+        """Leave no run behind, as nothing was learned yet."""
+        for path in (self.last, self.path / "config.json"):
+            path.unlink(missing_ok=True)
+
     def log(self, table: str, steps: int, figures: Mapping[str, float]) -> None:
         """Add a row to the CSV table, and a point to every TensorBoard curve.
 
@@ -149,6 +154,20 @@ class RunFolder:
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[None]:
+    """Let whatever asks a program to end interrupt it, as Ctrl-C does."""
+    main = threading.current_thread() is threading.main_thread()
+    deadly = [s for s in STOPPING if main and signal.getsignal(s) is signal.SIG_DFL]
+    for number in deadly:  # nohup has SIGHUP ignored, which it stays
+        signal.signal(number, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        for number in deadly:
+            signal.signal(number, signal.SIG_DFL)
 
 
 @contextlib.contextmanager

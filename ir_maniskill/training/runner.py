@@ -276,8 +276,11 @@ class Runner:
             yield
         except BaseException as error:
             diverged = isinstance(error, TrainingDivergedError)
+            failed = isinstance(error, Exception) and self.newest.metadata["steps"] == 0
+            if distributed.rank() == 0 and failed:
+                self.folder.forget()  # what is wrong may be in the config
             # Where it diverged, the older checkpoint is the good one.
-            if distributed.rank() == 0 and not diverged:
+            elif distributed.rank() == 0 and not diverged:
                 self.folder.save_at_last(self.newest)
             raise
 
@@ -287,11 +290,16 @@ class Runner:
         Raises:
             CheckpointError: If it does not fit the algorithm.
         """
+        if self.folder.best.exists():  # better refused now than at the end
+            try:
+                checkpoint.read(self.folder.best)
+            except CheckpointError as error:
+                hint = "or move it away: the next evaluation makes another"
+                raise CheckpointError(f"{error}; {hint}") from error
         try:
             self.algorithm.load_state_dict(stored.tensors)
             checkpoint.set_random_state(stored.tensors)
             if self.folder.best.exists():  # else the next evaluation's is the best
-                checkpoint.read(self.folder.best)  # better refused now than at the end
                 self.best_score = float(stored.metadata["best_score"])
             steps = stored.metadata["steps"]
             if type(steps) is not int or steps < 0:

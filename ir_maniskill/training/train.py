@@ -16,6 +16,7 @@ from ir_maniskill import experiment as catalog
 from ir_maniskill.agent.agent import Agent
 from ir_maniskill.agent.language_system import encoder_of
 from ir_maniskill.checks import require, require_choice
+from ir_maniskill.environment.robots.robot import robot_class
 from ir_maniskill.environment.vector import VectorEnv, make_vec
 from ir_maniskill.experiment import Experiment
 from ir_maniskill.policy import load_policy
@@ -29,7 +30,7 @@ from ir_maniskill.training.config import (
     require_same,
 )
 from ir_maniskill.training.ppo import PPO
-from ir_maniskill.training.run_folder import RunFolder, stored_config
+from ir_maniskill.training.run_folder import RunFolder, interruptible, stored_config
 from ir_maniskill.training.runner import Runner
 from ir_maniskill.training.sac import SAC
 
@@ -44,7 +45,7 @@ def train(
     resume: bool = False,
     envs: VectorEnv | None = None,
     eval_envs: VectorEnv | None = None,
-    algorithm: type[Algorithm] | None = None,
+    algorithm: type[Algorithm] | str | None = None,
     *,
     preset: str = "default",
     **changes: Any,
@@ -61,7 +62,7 @@ def train(
             folder's own config; of what is given only `MAY_CHANGE` may differ from it.
         envs: Vector of this rank's envs to use (and leave open) instead of making one.
         eval_envs: The same for evaluations, which only the first rank makes.
-        algorithm: What learns; None: what the config names.
+        algorithm: What learns, a class or "ppo" or "sac"; None: what the preset names.
         preset: Which of `CONFIGS` to train a task with; a run that is resumed keeps
             its own.
         **changes: Fields that shall be other than in the preset; a dict changes some
@@ -80,6 +81,8 @@ def train(
         WorkerError: If a simulator process died or hangs.
     """
     changes = {k: str(v) if isinstance(v, Path) else v for k, v in changes.items()}
+    if isinstance(algorithm, str):
+        changes["algorithm"], algorithm = algorithm, None
     require(isinstance(task, str), "task", task, "an id")
     require_choice("preset", preset, CONFIGS)
     known = [name for name in vars(CONFIGS[preset]) if name != "env_id"]
@@ -114,6 +117,7 @@ def run(
 ) -> Path:
     """Train as `train` does, but take `config` as it is, also to resume."""
     with contextlib.ExitStack() as leaving:
+        leaving.enter_context(interruptible())
         leaving.enter_context(distributed.group())
         _require_shares(config)
         folder = distributed.from_first(
@@ -131,11 +135,13 @@ def run(
             envs = make_envs(config, config.num_envs // distributed.size())
             leaving.callback(envs.close)
         _require_fit(config, envs)
+        _require_made_for(config, envs, "robot_uids", "control_mode", "reward_mode")
 
         @functools.cache
         def evaluated_in() -> VectorEnv:
             """Return the envs to evaluate in, made when they are first asked for."""
             if eval_envs is not None:
+                _require_made_for(config, eval_envs, "robot_uids", "control_mode")
                 return eval_envs
             count = min(config.num_envs, config.eval_episodes)
             made = make_envs(config, count, training=False)
@@ -203,6 +209,18 @@ def _require_fit(config: TrainConfig, envs: VectorEnv) -> None:
     episodes, sentences = config.eval_episodes, len(envs.experiment.sentences)
     expected = f"at least {sentences}, one for each sentence"
     require(episodes >= sentences, "eval_episodes", episodes, expected)
+
+
+def _require_made_for(config: TrainConfig, envs: VectorEnv, *names: str) -> None:
+    """Raise unless envs that were given were made as the config says."""
+    usual = {"robot_uids": "nao", "control_mode": "pd_joint_pos"}
+    made = {**usual, "reward_mode": "sparse", **envs.env_kwargs}
+    expected = config.env_kwargs(training=True)
+    for name in names:
+        got, wanted = made[name], expected[name]
+        if name == "robot_uids":
+            got, wanted = robot_class(got).uid, robot_class(wanted).uid
+        require(got == wanted, f"{name} of the envs given", got, f"{wanted!r}")
 
 
 def make_envs(config: TrainConfig, count: int, *, training: bool = True) -> VectorEnv:

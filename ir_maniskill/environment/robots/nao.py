@@ -140,6 +140,10 @@ class Nao(Robot):
         if self.urdf_path == OUR_URDF:
             self.urdf_path = os.environ.get(URDF_VARIABLE) or OUR_URDF
         if self.urdf_path == OUR_URDF:
+            self.postures = {  # legs, torso and head of our model have no joints
+                name: {joint: angles[joint] for joint in JOINTS if joint in angles}
+                for name, angles in POSTURES.items()
+            }
             super()._load_articulation(initial_pose)
             return
         given = Path(self.urdf_path)

@@ -11,6 +11,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +23,16 @@ from mani_skill.agents.registration import REGISTERED_AGENTS
 from mani_skill.utils.structs import Actor
 from torch import Tensor
 
+from ir_maniskill.checks import require, require_choice
 from ir_maniskill.environment.bodies import poses
 from ir_maniskill.environment.contacts import CpuTouchSensor, GpuTouchSensor
 from ir_maniskill.environment.robots.controller import TargetControllerConfig
 from ir_maniskill.environment.robots.loader import read_builder
 from ir_maniskill.environment.robots.urdf import RobotError, read_motors
 from ir_maniskill.experiment import Drawn, Experiment, ExperimentError
+
+SLACK = 1e-3
+"""How far a posture may be beyond a limit, by rounding [rad, m]."""
 
 
 @dataclass(frozen=True)
@@ -130,10 +135,19 @@ class Robot(BaseAgent, ABC):
     # -- Loading ---------------------------------------------------------------------
 
     def _load_articulation(self, initial_pose: Any = None) -> None:
+        what, positive = f"of the robot {self.uid!r}", "a finite number above 0"
+        for name in ("scale", "reach"):
+            value = getattr(self, name)
+            require(0 < value < math.inf, f"{name} {what}", value, positive, RobotError)
+        named = len(self.postures) > 0
+        require(named, f"postures {what}", self.postures, "at least one", RobotError)
         path = str(self.urdf_path)
         self._motors = read_motors(Path(path), self.joints)
         held = next(iter(self.postures.values()))
         builder = read_builder(self.scene, path, self.joints, held, self.urdf_config)
+        known = [link.joint_record.name for link in builder.link_builders]
+        for name in chain.from_iterable(self.postures.values()):
+            require_choice(f"joint of a posture {what}", name, known, RobotError)
         builder.set_name(self.uid)
         builder.initial_pose = self.mount
         self.robot = builder.build()
@@ -216,9 +230,15 @@ class Robot(BaseAgent, ABC):
         return names
 
     def _keyframe(self, angles: Mapping[str, float]) -> Keyframe:
-        position = self._middle.clone()
+        position, controller = self._middle.clone(), self.controller
         for index, name in enumerate(self.joints):
-            position[index] = angles.get(name, position[index])
+            angle = angles.get(name, float(position[index]))
+            low, high = (float(x[index]) for x in (controller.lower, controller.upper))
+            expected = f"from {low:g} to {high:g}, the joint's limits"
+            fits = low - SLACK <= angle <= high + SLACK
+            what = f"posture of the robot {self.uid!r}: {name}"
+            require(fits, what, angle, expected, RobotError)
+            position[index] = angle
         return Keyframe(pose=self.mount, qpos=self.to_qpos(position).cpu().numpy())
 
     # -- Control ---------------------------------------------------------------------
