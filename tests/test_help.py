@@ -13,12 +13,6 @@ from ir_maniskill import cli
 TASK = "NaoTouchCubeSingle-v1"
 
 
-@pytest.fixture(autouse=True)
-def signals_stay(monkeypatch):
-    """Let the program not handle the signals of the process that tests it."""
-    monkeypatch.setattr(cli.signal, "signal", lambda *_: None)
-
-
 def commands(capsys) -> set[str]:
     """Return the commands that there are, as an error lists them."""
     with pytest.raises(SystemExit):
