@@ -256,7 +256,7 @@ CONFIGS: dict[str, TrainConfig] = {
     "default": TrainConfig(),
     "listen": TrainConfig(
         algorithm="sac",
-        total_steps=600_000,
+        total_steps=880_000,
         eval_interval=100_000,
         frames=1,
         penalty_warmup=0.0,
