@@ -141,7 +141,7 @@ class StateEncoder(nn.Module):
     def forward(self, state: State) -> Tensor:
         """Return B_t [N, D] = [G_t, V_t, H_t]."""
         said: Tensor = self.language(*(state[name] for name in self.language.reads))
-        expected = len(state["instruction"]), self.language.width
+        expected = len(state[self.language.reads[0]]), self.language.width
         if said.shape != expected:
             name, got = type(self.language).__name__, tuple(said.shape)
             raise ValueError(f"{name}: got G_t {got}, expected {expected}: [N, width]")
