@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import torch
 
@@ -211,7 +211,7 @@ def collect(
     Raises:
         ConfigError: The folder is not empty, or "lerobot" lacks a package.
     """
-    require_choice("form", form, get_args(dataset.Format))
+    require_choice("form", form, dataset.Format)
     require_whole("height", height, 2)
     policy, experiment, chosen = _prepare(
         policy, task, any_task, episodes, seed, instruction, env_kwargs

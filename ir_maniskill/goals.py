@@ -220,13 +220,15 @@ class Measure(Lazy):
         n, f, c = scene.contact.shape
         truth, number, count = torch.bool, torch.float32, torch.int64
         kinds = {
-            **{"holds": (truth, n), "gap": (number, n), "serves": (truth, n, f, c)},
-            **{"bars": (truth, n, f, c), "level": (number, n), "still": (truth, n, c)},
-            **{
-                "may_move": (truth, n, c),
-                "aim": (number, n, c, 3),
-                "stage": (count, n),
-            },
+            "holds": (truth, n),
+            "gap": (number, n),
+            "serves": (truth, n, f, c),
+            "bars": (truth, n, f, c),
+            "level": (number, n),
+            "still": (truth, n, c),
+            "may_move": (truth, n, c),
+            "aim": (number, n, c, 3),
+            "stage": (count, n),
         }
         for name, (dtype, *shape) in kinds.items():
             value = vars(self).get(name)  # none if it comes later
