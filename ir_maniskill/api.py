@@ -249,7 +249,7 @@ def _prepare(
     experiment = catalog.get(task or policy.env_id)
     policy.require_match(experiment, env_kwargs.get("robot_uids"), any_task=any_task)
     wanted = None if instruction is None else [instruction]
-    split = experiment.in_split(env_kwargs.get("split") or "train")
+    split = experiment.in_split(env_kwargs.get("split"))
     for said in choose_instructions(split, wanted):
         if said is not None and not isinstance(experiment.instructions, Spoken):
             experiment.check_refs(said)

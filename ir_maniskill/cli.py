@@ -138,9 +138,9 @@ class Evaluate(_Play):
 
     instruction: str | None = None
     """Play this sentence only; None: all of the task's."""
-    split: str = "train"
+    split: str | None = None
     """What is new in the sentences, if they are spoken: train (nothing), wording,
-    objects, pairs or places."""
+    objects, pairs or places; None: the task's own, usually train."""
     episodes: int = 100
     """Episodes, spread evenly over the instructions."""
     num_envs: int = 8

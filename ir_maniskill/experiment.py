@@ -302,12 +302,14 @@ class Experiment:
             return Spoken.MAX_TOKENS
         return max(len(split_words(sentence)) for sentence in self.sentences)
 
-    def in_split(self, split: str) -> Experiment:
-        """Return the same with the sentences and places of another split.
+    def in_split(self, split: str | None) -> Experiment:
+        """Return the same with the sentences and places of a split; None: its own.
 
         Raises:
             ExperimentError: There is no such split, or the sentences are not spoken.
         """
+        if split is None:
+            return self
         if isinstance(self.instructions, Spoken):
             return replace(self, instructions=replace(self.instructions, split=split))
         _require(split == "train", f"split of {self.id}", split, "'train': it has none")

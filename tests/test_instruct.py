@@ -14,6 +14,7 @@ from ir_maniskill.environment.arguments import instructions_of
 from ir_maniskill.environment.layout import layout_of
 from ir_maniskill.environment.robots import Nao, Panda
 from ir_maniskill.environment.speaker import Speaker, _fits
+from ir_maniskill.environment.touch_env import TouchEnv
 from ir_maniskill.experiment import (
     Drawn,
     Experiment,
@@ -366,6 +367,21 @@ def test_spaces_do_not_depend_on_the_split() -> None:
         assert env.unwrapped.experiment.instructions.split == split
         env.close()
     assert spaces[0] == spaces[1]
+
+
+def test_a_task_is_played_in_its_own_split_unless_told_otherwise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(
+        catalog.CATALOG,
+        "Mine-v1",
+        Experiment("Mine-v1", Drawn(), Spoken(split="places")),
+    )
+    kwargs = {"experiment": "Mine-v1", "render_backend": "none"}
+    for split, played in ((None, "places"), ("train", "train")):
+        env = TouchEnv(split=split, obs_mode="state_dict", **kwargs)
+        assert env.experiment.instructions.split == played
+        env.close()
 
 
 def test_a_vector_plays_what_single_envs_play() -> None:

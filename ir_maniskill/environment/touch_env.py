@@ -88,7 +88,7 @@ class TouchEnv(RenderedEnv):
         render_backend: str | None = "auto",
         reward_weights: dict[str, float] | None = None,
         observe: Sequence[str] = (),
-        split: str = "train",
+        split: str | None = None,
         **kwargs: Any,
     ) -> None:
         """Build the env.
@@ -102,7 +102,7 @@ class TouchEnv(RenderedEnv):
             reward_weights: Changes of `RewardWeights`, for the dense reward modes.
             observe: What to observe beside the usual: "text" is the sentence's bytes.
             split: Of a task with `Spoken` instructions: "train", or what is held out
-                of it, "wording", "objects", "pairs" or "places".
+                of it, "wording", "objects", "pairs" or "places"; None: its own.
             *args: As for `BaseEnv`.
             **kwargs: As for `BaseEnv`.
 
