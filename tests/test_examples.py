@@ -57,16 +57,6 @@ def test_vector_envs_finish_two_episodes_each(tmp_path: Path) -> None:
 
 @pytest.mark.render
 @pytest.mark.slow
-def test_recorded_actions_are_replayed_with_pictures(tmp_path: Path) -> None:
-    arguments = ("--episodes", "1", "--obs-mode", "rgb")
-    out = run(tmp_path, script("record_and_replay.py"), *arguments)
-    assert "traj_0: rewards 0, places of objects 0 mm" in out
-    names = {path.name.split(".")[1] for path in tmp_path.rglob("*.h5")}
-    assert names == {"h5", "rgb"}
-
-
-@pytest.mark.render
-@pytest.mark.slow
 def test_maniskills_ppo_layout_trains(tmp_path: Path) -> None:
     arguments = ("--iterations", "2", "--steps", "32")
     out = run(tmp_path, script("maniskill_ppo.py"), *arguments)
