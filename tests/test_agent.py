@@ -116,7 +116,7 @@ def test_repeated_sentences_are_encoded_alike_and_share_their_gradient():
 
 
 def test_vision_of_the_paper_sets_cameras_side_by_side():
-    vision = PaperVision(3, 2)
+    vision = PaperVision(3, (2, 128, 64), 0)
     seen = []
     vision.maps[0].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
     images = torch.zeros(1, 3, 2, 128, 64, 3, dtype=torch.uint8)

@@ -16,7 +16,6 @@ from ir_maniskill.agent.critic import Critic, Standardize
 from ir_maniskill.agent.object_vision import ObjectVision
 from ir_maniskill.agent.perceptual_system import (
     BODY_WIDTH,
-    VISION_WIDTH,
     BodySense,
     PaperVision,
     PatchVision,
@@ -25,6 +24,12 @@ from ir_maniskill.checks import require
 from ir_maniskill.environment.senses import State, askable
 from ir_maniskill.environment.senses import entries as entries_of
 
+VISIONS: dict[str, Any] = {
+    "patches": PatchVision,
+    "paper": PaperVision,
+    "objects": ObjectVision,
+}
+"""What `AgentConfig.vision` names."""
 READING_WIDTH = 128
 """Units that G_t is brought to where vision is "objects"."""
 
@@ -113,30 +118,20 @@ class StateEncoder(nn.Module):
         self.vision: nn.Module | None = None
         self.standardize: Standardize | None = None
         self.body: BodySense | None = None
+        self.width = width  # of G_t, and below of B_t
         if "images" in entries:
-            self.vision = self._vision(config, spec.shapes["images"], width)
+            frames, *size, _ = spec.shapes["images"]
+            self.vision = vision = VISIONS[config.vision](frames, size, width)
+            self.width += vision.width
+        self.seen = slice(width, self.width)
+        """Where V_t is in B_t."""
         if "privileged" in entries:
             self.standardize = Standardize(*spec.shapes["privileged"])
         if self.felt:
             inputs = sum(math.prod(spec.shapes[name]) for name in self.felt)
             self.body = BodySense(inputs, normalize=config.vision != "paper")
-        self.width = width  # of G_t, and below of B_t
-        if self.vision is not None:
-            objects = config.vision == "objects"
-            self.width += ObjectVision.width if objects else VISION_WIDTH
-        self.seen = slice(width, self.width)
-        """Where V_t is in B_t."""
-        self.width += BODY_WIDTH if self.felt else 0
+            self.width += BODY_WIDTH
         self.alignment = Alignment()
-
-    def _vision(
-        self, config: AgentConfig, shape: tuple[int, ...], film_width: int
-    ) -> nn.Module:
-        frames, cameras, height, width, _ = shape
-        if config.vision == "paper":
-            return PaperVision(frames, cameras)
-        kind = ObjectVision if config.vision == "objects" else PatchVision
-        return kind(frames, (cameras, height, width), film_width)
 
     def forward(self, state: State) -> Tensor:
         """Return B_t [N, D] = [G_t, V_t, H_t]."""
@@ -151,13 +146,11 @@ class StateEncoder(nn.Module):
         if self.vision is not None:
             embeddings.append(self.vision(state["images"], said))
         if self.body is not None:
-            embeddings.append(self.body(*(self._sense(state, k) for k in self.felt)))
+            felt = {name: state[name] for name in self.felt}
+            if self.standardize is not None:
+                felt["privileged"] = self.standardize(felt["privileged"])
+            embeddings.append(self.body(*felt.values()))
         return self.alignment(*embeddings)
-
-    def _sense(self, state: State, name: str) -> Tensor:
-        if name == "privileged" and self.standardize is not None:
-            return self.standardize(state[name])
-        return state[name]
 
 
 class Agent(nn.Module):

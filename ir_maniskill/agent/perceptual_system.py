@@ -1,6 +1,7 @@
 """Perceptual System: images become V_t; proprioception and touch become H_t."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -25,14 +26,13 @@ def pixels(images: Tensor) -> Tensor:
 class PaperVision(nn.Module):
     """V_t as in the paper: two 5x5 convolutions over all cameras set side by side."""
 
-    height, width = 128, 64
-    """Size each camera's image is brought to [pixel]."""
+    width = VISION_WIDTH
 
-    def __init__(self, frames: int, cameras: int) -> None:
-        """Make the net for `frames` stacked images of `cameras` cameras."""
+    def __init__(self, frames: int, size: Sequence[int], film_width: int) -> None:
+        """Make the net for `frames` stacked images of size[0] cameras."""
         super().__init__()
-        sides = (self.height, self.width * cameras)
-        maps = [((side - 4) // 2 - 4) // 2 for side in sides]  # [pixel] after pooling
+        self.size = 128, 64 * size[0]  # what the images are brought to [pixel]
+        maps = [((side - 4) // 2 - 4) // 2 for side in self.size]  # after pooling
         self.maps = nn.Sequential(
             *(nn.Conv2d(3 * frames, 12, 5), nn.ReLU(), nn.MaxPool2d(2)),
             *(nn.Conv2d(12, 12, 5), nn.ReLU(), nn.MaxPool2d(2)),
@@ -47,9 +47,8 @@ class PaperVision(nn.Module):
         del language
         wide = [torch.cat(frame.unbind(1), dim=2) for frame in images.unbind(1)]
         joined = pixels(torch.cat(wide, dim=-1))  # [N, 3S, H, K*W]
-        size = (self.height, self.width * images.shape[2])
-        if joined.shape[-2:] != size:
-            joined = functional.interpolate(joined, size, mode="area")
+        if joined.shape[-2:] != self.size:
+            joined = functional.interpolate(joined, self.size, mode="area")
         return self.embedding(self.maps(joined).flatten(1))
 
 
@@ -91,9 +90,9 @@ class PatchVision(nn.Module):
     V_t is brought to the scale of G_t, so that the actor hears both from the start.
     """
 
-    def __init__(
-        self, frames: int, size: tuple[int, int, int], film_width: int
-    ) -> None:
+    width = VISION_WIDTH
+
+    def __init__(self, frames: int, size: Sequence[int], film_width: int) -> None:
         """Make the nets for images of `size` (cameras, height, width)."""
         super().__init__()
         cameras, *sides = size

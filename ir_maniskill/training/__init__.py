@@ -1,1 +1,1 @@
-"""Training: roll-outs, PPO, checkpoints and the loop around them."""
+"""Training: PPO, SAC with hindsight and imitation, checkpoints, the loop around."""

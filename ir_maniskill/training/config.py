@@ -93,8 +93,8 @@ class SACConfig:
     batch: int = 256
     """Steps of each gradient."""
     gradients: int = 2
-    """Gradients of the critics for each step of all envs; the teacher has half of
-    them."""
+    """Gradients of the critics for each step of all envs; with the first, and then
+    every second, the teacher has one, too."""
     policy_from: float = 0.56
     """Share of the training in which the teacher learns; in the rest, the policy
     learns from it."""
@@ -243,7 +243,8 @@ class TrainConfig:
         }
         asked = asks(self.agent)
         if training and self.algorithm == "sac":
-            asked = tuple({*asked, "snapshot", "joint_velocity", "text"})
+            more = ("snapshot", "joint_velocity", "text")
+            asked = tuple(dict.fromkeys((*asked, *more)))
         if asked:
             kwargs["observe"] = asked
         if training:

@@ -7,6 +7,7 @@ J joints, F fingers.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -52,15 +53,13 @@ class Mirror:
 
     def scene(self, scene: Snapshot) -> Snapshot:
         """Return scenes in the mirror."""
-        return Snapshot(
+        return replace(
+            scene,
             contact=scene.contact[:, self._fingers],
             fingertip=scene.fingertip[:, self._fingers] * ACROSS,
             pose=scene.pose * TURNED,
             start=scene.start * TURNED,
             velocity=scene.velocity * ACROSS,
-            color=scene.color,
-            shape=scene.shape,
-            stage=scene.stage,
         )
 
     def _snapshot(self, rows: Tensor) -> Tensor:

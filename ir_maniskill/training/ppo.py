@@ -99,8 +99,7 @@ class PPO(Algorithm):
         with torch.no_grad():
             last_value = self.agent.value(self._next)
         rollout.finish(last_value, config.gamma, config.gae_lambda)
-        threads = self._threads
-        figures = improve(self.agent, self.optimizer, rollout, config, threads)
+        figures = improve(self.agent, self.optimizer, rollout, config, self._threads)
         if "privileged" in rollout.state:
             seen = distributed.gather(rollout.state["privileged"].flatten(0, 1))
             self.agent.observe(seen)

@@ -74,13 +74,15 @@ class Replay:
         self.episodes += 1
 
     def _make_room(self, like: Mapping[str, Tensor]) -> None:
-        """Make or map the rows, when the first episode tells what they have."""
+        """Make the files, all 0, when the first episode tells what a row has."""
         if self._rows:
             return
+        self._folder.mkdir(parents=True, exist_ok=True)
         marks = dict.fromkeys((EPISODE, AGE, LENGTH), torch.zeros(1, dtype=torch.int64))
         for name, rows in {**like, **marks}.items():
-            empty = rows.new_zeros(1).expand(self.capacity, *rows.shape[1:])
-            self._rows[name] = self._kept(name, empty)
+            shape, kind = (self.capacity, *rows.shape[1:]), rows.numpy().dtype
+            made = open_memmap(self._folder / f"{name}.npy", "w+", kind, shape)
+            self._rows[name] = torch.from_numpy(made)
         self._rows[EPISODE].fill_(-1)
 
     def _require_space(self, size: int) -> None:
@@ -89,12 +91,6 @@ class Replay:
             return
         with writing(self._folder):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    def _kept(self, name: str, rows: Tensor) -> Tensor:
-        """Return room for such rows in a new file, all 0."""
-        self._folder.mkdir(parents=True, exist_ok=True)
-        path, kind = self._folder / f"{name}.npy", rows.numpy().dtype
-        return torch.from_numpy(open_memmap(path, "w+", kind, tuple(rows.shape)))
 
     # -- Reading ---------------------------------------------------------------------
 

@@ -109,7 +109,7 @@ class RunFolder:
                 f"{table}: got {error}, expected a column `steps` of whole numbers; "
                 "mend it, or move it away"
             ) from error
-        self.write(table.name, _format(_columns(table), rows))
+        self.write(table.name, _format(list(rows[0]) if rows else [], rows))
         return int(rows[-1]["steps"]) if rows else 0
 
     def write(self, name: str, data: bytes) -> None:
@@ -135,10 +135,10 @@ class RunFolder:
         A figure that is new gets a column, in which earlier rows have "nan".
         """
         path, row = self.path / f"{table}.csv", {"steps": steps, **figures}
-        columns = _columns(path)
+        rows = whole_rows(path) if path.exists() else []
+        columns = list(rows[0]) if rows else []
         if row.keys() - set(columns):
             columns = list(dict.fromkeys([*columns, *row]))
-            rows = whole_rows(path) if path.exists() else []
             self.write(path.name, _format(columns, rows))
         with writing(path), path.open("ab") as file:
             file.write(_format(columns, [row], header=False))
@@ -201,12 +201,6 @@ def whole_rows(table: Path) -> list[dict[str, str]]:
         lines = [line for line in file if line.endswith("\n")]
     rows = csv.DictReader(lines)
     return [row for row in rows if None not in row and None not in row.values()]
-
-
-def _columns(table: Path) -> list[str]:
-    """Return the names in the first row of a CSV table; none if there is none."""
-    rows = whole_rows(table) if table.exists() else []
-    return list(rows[0]) if rows else []
 
 
 def _format(

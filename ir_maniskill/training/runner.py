@@ -141,12 +141,11 @@ class Runner:
         info = info_of_step(info, done)
         self.state = self._here(self.stack.push(obs, done))
         self.counts.add(reward, done, info)
-        ends = {"terminated": terminated, "truncated": truncated}
-        paid = {"reward": reward}
+        told = {"reward": reward, "terminated": terminated, "truncated": truncated}
         if "reward_terms" in info:
-            paid["terms"] = info["reward_terms"]
-        check_finite(paid, "outcome", "the simulation became unstable")
-        here = self._here(paid | ends)
+            told["terms"] = info["reward_terms"]
+        check_finite(told, "outcome", "the simulation became unstable")
+        here = self._here(told)
         self.algorithm.observe(Outcome(**here, state=self.state, final=final))
         self.steps += self.config.num_envs
         return self._learned() if figures is None else figures

@@ -78,17 +78,9 @@ class Critics(nn.Module):
     def __init__(self, inputs: int) -> None:
         """Make the layers for D + A numbers."""
         super().__init__()
-        widths = (inputs, *WIDTHS, 1)
-        pairs = list(itertools.pairwise(widths))
-        bound = [1 / math.sqrt(into) for into, _ in pairs]
-        self.weights = nn.ParameterList(
-            torch.empty(2, *pair).uniform_(-b, b)
-            for pair, b in zip(pairs, bound, strict=True)
-        )
-        self.biases = nn.ParameterList(
-            torch.empty(2, 1, out).uniform_(-b, b)
-            for (_, out), b in zip(pairs, bound, strict=True)
-        )
+        sizes = list(itertools.pairwise((inputs, *WIDTHS, 1)))
+        self.weights = nn.ParameterList(_drawn(2, n, m, of=n) for n, m in sizes)
+        self.biases = nn.ParameterList(_drawn(2, 1, m, of=n) for n, m in sizes)
 
     def forward(self, known: Tensor, action: Tensor) -> Tensor:
         """Return both values [2, B] of what is known [B, D] and done [B, A]."""
@@ -100,6 +92,11 @@ class Critics(nn.Module):
                 x = functional.relu(functional.layer_norm(x, x.shape[-1:]))
         weight, bias = last
         return torch.baddbmm(bias, x.float(), weight).squeeze(-1)
+
+
+def _drawn(*shape: int, of: int) -> Tensor:
+    """Return numbers of a layer `of` so many inputs, as nn.Linear draws them."""
+    return torch.empty(shape).uniform_(-1 / math.sqrt(of), 1 / math.sqrt(of))
 
 
 def adam(weights: Iterable[Tensor], rate: float) -> torch.optim.Adam:
@@ -138,7 +135,6 @@ class SAC(Algorithm):
         self.frames, self.actions = config.frames, actions
         self._threads = config.threads or distributed.cores()
         self.agent = Agent(config.agent, StateSpec.of(state, actions))
-        self.agent.to(state["instruction"].device)
         stacks = stacked(state)
         self._sensed = {name: name in stacks for name in self.agent.encoder.sensed}
         """What the policy senses, and whether it is stacked."""
@@ -429,16 +425,13 @@ class SAC(Algorithm):
 
     def _descend(self, name: str, loss: Tensor) -> None:
         """Make one step against a loss; the others' weights get no gradient."""
-        weights = self._weights(name)
-        gradients = torch.autograd.grad(loss, weights)
-        for weight, gradient in zip(weights, gradients, strict=True):
-            weight.grad = gradient.contiguous()
+        self._optimizers[name].zero_grad()
+        loss.backward(inputs=self._weights(name))
         self._step(name)
 
     def _weights(self, name: str) -> list[Tensor]:
         """Return what an optimizer improves."""
-        groups = self._optimizers[name].param_groups
-        return [weight for group in groups for weight in group["params"]]
+        return self._optimizers[name].param_groups[0]["params"]
 
     def _step(self, name: str) -> None:
         """Make one step of an optimizer."""
