@@ -195,7 +195,7 @@ def collect(
     seed: int = dataset.DATASET_SEED,
     height: int = 256,
     failures: bool = False,
-    instruction: str | Instruction | None = None,
+    instruction: str | None = None,
     any_task: bool = False,
     progress: bool = True,
     **env_kwargs: Any,
@@ -212,6 +212,8 @@ def collect(
         ConfigError: The folder is not empty, or "lerobot" lacks a package.
     """
     require_choice("form", form, dataset.Format)
+    text = isinstance(instruction, str | None)  # files do not hold goals of one's own
+    require(text, "instruction", instruction, "a sentence")
     require_whole("height", height, 2)
     policy, experiment, chosen = _prepare(
         policy, task, any_task, episodes, seed, instruction, env_kwargs
@@ -249,8 +251,8 @@ def _prepare(
     experiment = catalog.get(task or policy.env_id)
     policy.require_match(experiment, env_kwargs.get("robot_uids"), any_task=any_task)
     wanted = None if instruction is None else [instruction]
-    split = experiment.in_split(env_kwargs.get("split"))
-    for said in choose_instructions(split, wanted):
+    experiment = experiment.in_split(env_kwargs.get("split"))
+    for said in choose_instructions(experiment, wanted):
         if said is not None and not isinstance(experiment.instructions, Spoken):
             experiment.check_refs(said)
     return policy, experiment, wanted

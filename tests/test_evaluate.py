@@ -255,3 +255,11 @@ def test_a_sentence_of_a_split_is_played_in_that_split(monkeypatch):
     assert told == ["red cube pls"]
     with pytest.raises(ValueError, match="got 'pls' as word 3"):
         ir_maniskill.evaluate("NaoInstruct-v1", **said)
+
+
+def test_a_vector_in_a_split_is_told_sentences_of_it():
+    kwargs = {"split": "wording", "obs_mode": "state", "render_backend": "none"}
+    envs = ir_maniskill.make_vec("NaoInstruct-v1", 1, **kwargs)
+    envs.reset(seed=0, options={"instruction": "red cube pls"})
+    assert envs.get_attr("instructions")[0][0].text == "red cube pls"
+    envs.close()

@@ -347,9 +347,10 @@ def test_what_a_file_lacks_is_named(tmp_path: Path, part: str, named: str) -> No
         ({"fingertips": {"tip": "tip_9"}}, "finger 'tip' .*tip_9.*available: .*tip_2"),
         ({"phalanges": {"tip": ("palm",)}}, "finger 'tip' .*palm.*available: .*tip_2"),
         ({"hands": {"hand": ("thumb",)}}, r"finger 'thumb' .*\(\).*available: .*tip_2"),
+        ({"shoulders": ()}, r"shoulders of .*'stick': got \(\), .* \('hand',\)"),
     ],
 )
-def test_a_finger_without_links_is_named(
+def test_a_hand_or_finger_that_lacks_something_is_named(
     tmp_path: Path, changes: dict[str, object], named: str
 ) -> None:
     with pytest.raises(RobotError, match=named):

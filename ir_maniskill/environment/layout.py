@@ -76,7 +76,7 @@ class Free:
         self.split = split
         self.reach = robot.reach / robot.scale
         shoulders = [np.array(place) / robot.scale for place in robot.shoulders]
-        self.hands = dict(zip(robot.hands, shoulders, strict=False))
+        self.hands = dict(zip(robot.hands, shoulders, strict=True))
         self.pool, self.slots = len(drawn.pool), drawn.count[1]
         self.noise = 1 + self.pool + 2 * self.slots * CANDIDATES
         """Uniform numbers that a scene is made of."""

@@ -71,9 +71,10 @@ class ProcessVectorEnv(VectorEnv):
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
         cores = len(os.sched_getaffinity(0))
         workers = min(num_envs, num_workers or cores)
-        self.experiment, self.num_envs, self._timeout = experiment, num_envs, timeout
+        self.num_envs, self._timeout = num_envs, timeout
         self.env_kwargs = env_kwargs or {}
         """What the envs were made with."""
+        self.experiment = experiment.in_split(self.env_kwargs.get("split"))
         self._rows = [r.tolist() for r in np.array_split(np.arange(num_envs), workers)]
         self._pipes: list[Connection] = []
         self._processes: list[mp.process.BaseProcess] = []
@@ -84,7 +85,7 @@ class ProcessVectorEnv(VectorEnv):
         try:
             _require_main()
             self._start()
-            self._make(self.env_kwargs)
+            self._make(experiment)
         except BaseException:
             self.close()
             raise
@@ -111,12 +112,12 @@ class ProcessVectorEnv(VectorEnv):
             self._pipes.append(ours)
             self._processes.append(process)
 
-    def _make(self, env_kwargs: dict[str, Any]) -> None:
+    def _make(self, experiment: Experiment) -> None:
         """Have the envs made, learn their spaces and hand out the shared memory."""
         # Reading the robot's class, a worker imports the module that registers it.
-        robot = robot_class(env_kwargs.get("robot_uids", Nao.uid))
-        known = self.experiment, robot, senses.registered()
-        makes = [(*known, rows, env_kwargs) for rows in self._rows]
+        robot = robot_class(self.env_kwargs.get("robot_uids", Nao.uid))
+        known = experiment, robot, senses.registered()
+        makes = [(*known, rows, self.env_kwargs) for rows in self._rows]
         record, *spaces = self._command("make", makes)[0]
         self.single_observation_space, self.single_action_space = spaces
         self.observation_space, self.action_space = (

@@ -20,11 +20,8 @@ from torch import Tensor
 class RenderedEnv(BaseEnv):
     """Overrides of `BaseEnv` that have to do with pictures alone."""
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        """Build the env; all arguments are those of `BaseEnv`."""
-        self._colors_only = False  # without a renderer no sensors are set up
-        self._drawing = False  # whether pictures of this very state are under way
-        super().__init__(*args, **kwargs)
+    _colors_only = False  # without a renderer no sensors are set up
+    _drawing = False  # whether pictures of this very state are under way
 
     def _setup_sensors(self, options: dict) -> None:
         # Picture formats are global: a video camera made earlier leaves floats behind.

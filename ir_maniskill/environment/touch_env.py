@@ -187,7 +187,7 @@ class TouchEnv(RenderedEnv):
     # -- Episode ---------------------------------------------------------------------
 
     def _initialize_episode(self, env_idx: Tensor, options: dict) -> None:
-        slots, joints = self.experiment.slots, len(self.agent.start_qpos)
+        slots, joints = self.experiment.slots, len(self.agent.joints)
         laid = self.layout.noise if self._speaker is None else 0  # it draws its own
         sizes = [1, laid, slots, joints]
         noise = self._batched_episode_rng[env_idx].uniform(size=sum(sizes))
@@ -207,9 +207,7 @@ class TouchEnv(RenderedEnv):
             self.instructional_set, self.instruction_index = self._told(env_idx, told)
         self._place_objects(env_idx, slot, xy, 2 * yaw - 1)
         jitter = self._tensor(2 * joint - 1) * self.experiment.jitter.joints
-        jitter = jitter * self.agent.jitter_unit
-        qpos = self.agent.clamp_qpos(self.agent.start_qpos + jitter)
-        self.agent.robot.set_qpos(qpos)
+        self.agent.robot.set_qpos(self.agent.start(jitter))
         self._touch.clear(env_idx)
         self._drawing = False
         self._begin(env_idx)

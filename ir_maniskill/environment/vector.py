@@ -50,7 +50,6 @@ def make_vec(
         OSError: There is too little shared memory.
     """
     experiment = catalog.get(task_id)
-    experiment.in_split(env_kwargs.get("split"))  # refused here, if it is none
     require_whole("num_envs", num_envs, 1)
     if num_workers is not None:
         require_whole("num_workers", num_workers, 1)

@@ -98,13 +98,6 @@ close to it; forearms and hands do collide with it and with the other arm."""
 UPPER_ARM = ("Shoulder", "Bicep", "Elbow")
 LOWER_ARM = ("ForeArm", "_wrist", "_gripper", "Finger", "Thumb")
 
-# -- Reach ---------------------------------------------------------------------------
-
-SHOULDERS = ((0.0, 0.098), (0.0, -0.098))
-"""Where the arms start, seen from above (x, y) [m]."""
-REACH = 0.255
-"""Farthest that an object's center may be from a shoulder, seen from above [m]."""
-
 # -- The robot -----------------------------------------------------------------------
 
 OUR_URDF = str(URDF_PATH)
@@ -128,8 +121,8 @@ class Nao(Robot):
     fingertips = FINGERTIPS
     postures = POSTURES
     mirror = MIRROR
-    shoulders = SHOULDERS
-    reach = REACH
+    shoulders = ((0.0, 0.098), (0.0, -0.098))
+    reach = 0.255
     solver_iterations = 4
 
     def drive(self, joint: str) -> JointGroup:

@@ -93,11 +93,6 @@ class Robot(BaseAgent, ABC):
     """If left and right are alike: of each joint and finger the one on the other side,
     and the sign of its angle there. The learner `sac` then learns from what it did as
     if it had been the other way round, too; cameras must stand in the middle."""
-    start_qpos: Tensor
-    """Start of every episode, in the simulator's order [J] [rad]."""
-    jitter_unit: Tensor
-    """What a jitter of 1 rad is to each joint, in the simulator's order [J]: 1, and of
-    a slide as much of its range as a radian is of half a turn [m]."""
 
     @abstractmethod
     def drive(self, joint: str) -> JointGroup:
@@ -139,6 +134,9 @@ class Robot(BaseAgent, ABC):
         for name in ("scale", "reach"):
             value = getattr(self, name)
             require(0 < value < math.inf, f"{name} {what}", value, positive, RobotError)
+        shoulders, each = self.shoulders, f"one for each of {tuple(self.hands)}"
+        paired = len(shoulders) == len(self.hands)
+        require(paired, f"shoulders {what}", shoulders, each, RobotError)
         named = len(self.postures) > 0
         require(named, f"postures {what}", self.postures, "at least one", RobotError)
         path = str(self.urdf_path)
@@ -195,18 +193,18 @@ class Robot(BaseAgent, ABC):
         controller = self.controller
         self._order = controller.active_joint_indices  # [J] action order -> qpos
         # ManiSkill's `get_qlimits` goes through all envs, so it is asked only once.
-        self._limits = [self.to_qpos(x) for x in (controller.lower, controller.upper)]
+        self._limits = [self._to_qpos(x) for x in (controller.lower, controller.upper)]
         self._middle = (controller.lower + controller.upper) / 2  # [J] [rad]
         self._half_range = (controller.upper - controller.lower) / 2  # [J] [rad]
         slides = torch.tensor([self._motors[name].slides for name in self.joints])
         unit = self._half_range / (math.pi / 2)
         unit = unit.where(slides.to(self.device), 1.0)
-        self.jitter_unit = self.to_qpos(unit)
+        self._jitter_unit = self._to_qpos(unit)
         self.keyframes = {
             name: self._keyframe(angles) for name, angles in self.postures.items()
         }
         start = next(iter(self.keyframes.values())).qpos
-        self.start_qpos = torch.as_tensor(start, device=self.device)
+        self._start = torch.as_tensor(start, device=self.device)
 
     def _phalanges_of(self, finger: str) -> tuple[str, ...]:
         """Return the names of a finger's links."""
@@ -239,7 +237,7 @@ class Robot(BaseAgent, ABC):
             what = f"posture of the robot {self.uid!r}: {name}"
             require(fits, what, angle, expected, RobotError)
             position[index] = angle
-        return Keyframe(pose=self.mount, qpos=self.to_qpos(position).cpu().numpy())
+        return Keyframe(pose=self.mount, qpos=self._to_qpos(position).cpu().numpy())
 
     # -- Control ---------------------------------------------------------------------
 
@@ -283,19 +281,20 @@ class Robot(BaseAgent, ABC):
             raise ValueError(f"action: got {action.tolist()}, expected finite numbers")
         self.controller.set_action(action)
 
-    def to_qpos(self, position: Tensor) -> Tensor:
-        """Reorder joint positions from the action's order to the simulator's.
+    def start(self, jitter: Tensor) -> Tensor:
+        """Return the start of episodes in the simulator's order [N, J] [rad].
 
         Args:
-            position: Joint positions in the order of `joints` [..., J] [rad].
+            jitter: By how much each joint is moved, in the same order [N, J] [rad]; a
+                slide by as much of its range as a radian is of half a turn.
         """
+        return (self._start + jitter * self._jitter_unit).clamp(*self._limits)
+
+    def _to_qpos(self, position: Tensor) -> Tensor:
+        """Reorder [..., J] from the action's order to the simulator's."""
         qpos = torch.empty_like(position)
         qpos[..., self._order] = position
         return qpos
-
-    def clamp_qpos(self, qpos: Tensor) -> Tensor:
-        """Keep joint positions in the simulator's order within the limits [..., J]."""
-        return qpos.clamp(*self._limits)
 
     # -- Senses ----------------------------------------------------------------------
 

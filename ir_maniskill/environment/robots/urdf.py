@@ -7,6 +7,7 @@ Pure: knows XML and numbers. Errors name the link or joint; `read_urdf` and
 from __future__ import annotations
 
 import math
+from codecs import BOM_UTF8
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -35,16 +36,12 @@ def read_urdf(path: Path) -> Element:
     if not path.is_file():
         raise RobotError(f"{path}: no such file")
     try:  # a declaration must come first, but what editors put before it does no harm
-        robot = ElementTree.fromstring(path.read_bytes().removeprefix(_BOM).strip())
+        robot = ElementTree.fromstring(path.read_bytes().removeprefix(BOM_UTF8).strip())
     except ElementTree.ParseError as error:
         raise RobotError(f"{path}: not XML, hence no URDF: {error}") from error
     if robot.tag != "robot":
         raise RobotError(f"{path}: got <{robot.tag}>, expected the <robot> of a URDF")
     return robot
-
-
-_BOM = b"\xef\xbb\xbf"
-"""The mark with which some editors begin a file in UTF-8."""
 
 
 @contextmanager
@@ -135,7 +132,7 @@ def check(robot: Element) -> None:
     for joint in by_name(robot, "joint").values():
         if joint.get("type") != "fixed":
             with naming(joint):
-                axis(joint)
+                check_axis(joint)
 
 
 def check_link(link: Element) -> None:
@@ -234,13 +231,12 @@ def numbers(
     return values
 
 
-def axis(joint: Element) -> list[float]:
-    """Return the axis of a joint, of any length but 0."""
+def check_axis(joint: Element) -> None:
+    """Raise RobotError if the axis of a joint is 0."""
     element = joint.find("axis")
     xyz = [1.0, 0.0, 0.0] if element is None else numbers(element, "xyz", 3, "1 0 0")
     if np.linalg.norm(xyz) < 1e-6:
         raise RobotError(f"<axis> xyz: got {_text(xyz)}, expected a direction")
-    return xyz
 
 
 def mass_and_inertia(inertial: Element) -> tuple[float, np.ndarray]:
