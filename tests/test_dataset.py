@@ -47,15 +47,17 @@ def test_maniskill_replays_what_was_recorded(policy: Policy, tmp_path: Path) -> 
     episodes = json.loads(recorded.with_suffix(".json").read_text())["episodes"]
     assert [e["instruction"] for e in episodes] == ["Touch the blue cube."] * 2
     assert [e["episode_seed"] for e in episodes] == [SEED, SEED + 1]
-    replay_trajectory.main(
-        replay_trajectory.Args(str(recorded), save_traj=True, record_rewards=True)
-    )
-    (replayed,) = tmp_path.glob(f"{CUBE}.*.h5")
+    again = replay_trajectory.Args(str(recorded), save_traj=True, record_rewards=True)
+    again.obs_mode = "rgb"
+    replay_trajectory.main(again)
+    (replayed,) = tmp_path.glob(f"{CUBE}.rgb.*.h5")
     with h5py.File(recorded) as first, h5py.File(replayed) as second:
         for name in ("traj_0", "traj_1"):
             rewards = first[name]["rewards"][:]
             assert rewards.sum() > 0
             np.testing.assert_array_equal(rewards, second[name]["rewards"][:])
+            pictures = second[name]["obs/sensor_data/front_camera/rgb"]
+            assert pictures.shape[0] == len(rewards) + 1 and pictures[:].std() > 10
 
 
 def test_episodes_that_fail_are_left_out(policy: Policy, tmp_path: Path) -> None:

@@ -93,8 +93,8 @@ class SACConfig:
     batch: int = 256
     """Steps of each gradient."""
     gradients: int = 2
-    """Gradients of the critics for each step of all envs; with the first, and then
-    every second, the teacher has one, too."""
+    """Gradients of the critics for each step of all envs. The teacher has one after the
+    first and after every second from there."""
     policy_from: float = 0.56
     """Share of the training in which the teacher learns; in the rest, the policy
     learns from it."""

@@ -306,7 +306,7 @@ class Robot(BaseAgent, ABC):
             [N, J] with the joints' limits mapped to [-1, 1].
         """
         return {
-            "proprioception": self._normalize(self._ordered(self.robot.get_qpos())),
+            "proprioception": self._normalize(self.controller.qpos),
             "target": self._normalize(self.controller.target),
         }
 
@@ -321,15 +321,11 @@ class Robot(BaseAgent, ABC):
 
     def joint_velocity(self) -> Tensor:
         """Return joint velocities in the action's order [N, J] [rad/s]."""
-        return self._ordered(self.robot.get_qvel())
+        return self.controller.qvel
 
     def finger_position(self) -> Tensor:
         """Return where the fingertips' links are [N, F, 3] [m]."""
         return poses(self.fingertip_links)[..., :3]
-
-    def _ordered(self, joints: Tensor) -> Tensor:
-        """Reorder [N, J] from the simulator's order to the action's."""
-        return joints.index_select(1, self._order)
 
     def _normalize(self, position: Tensor) -> Tensor:
         return ((position - self._middle) / self._half_range).clamp(-1, 1)
