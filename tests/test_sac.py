@@ -75,7 +75,7 @@ def test_steps_are_drawn_with_the_sentence_that_they_are_judged_under(tmp_path) 
     algorithm = collected(tmp_path, ToyVectorEnv(snapshots=True))
     algorithm.config = dataclasses.replace(algorithm.config, batch=600)
     drawn = same(algorithm._draw)
-    seen = same(lambda: algorithm._seen(*algorithm._rows()))
+    seen = same(lambda: algorithm._policy_batch(*algorithm._rows()))
     goal = torch.where(seen["instruction"][:, 1] == 4, -0.6, 0.6)  # token 4: "left"
     off = (drawn["next.now.proprioception"][:, 0] - goal).abs()
     near, far = off < 0.2, off > 0.5
@@ -121,11 +121,11 @@ def test_a_sense_of_ones_own_is_kept_whole(tmp_path, monkeypatch) -> None:
     agent = toy_sac(tmp_path).agent
     agent = dataclasses.replace(agent, senses=("proprioception", "height"))
     algorithm = collected(tmp_path, Taller(snapshots=True), agent=agent)
-    seen = algorithm._seen(*algorithm._rows())
+    seen = algorithm._policy_batch(*algorithm._rows())
     joints = seen["proprioception"][:, 0]
     torch.testing.assert_close(seen["height"], torch.cat([joints, -joints], dim=1))
     algorithm.share = 0.5
-    algorithm._imitate()
+    algorithm._train_policy()
 
 
 def test_checkpoints_are_rarer_than_episodes(tmp_path) -> None:
@@ -172,26 +172,26 @@ def test_the_teacher_draws_the_joint_targets_to_a_posture(tmp_path) -> None:
     with torch.no_grad():
         last.weight.zero_()
         last.bias[:2] = posture
-    seen = algorithm._seen(*algorithm._rows())
+    seen = algorithm._policy_batch(*algorithm._rows())
     seen["now.target"] = target = torch.rand_like(seen["now.target"])
     expected = torch.tanh(2 * (posture - target))
-    done = algorithm._taught(seen).mean
+    done = algorithm._teacher_policy(seen).mean
     torch.testing.assert_close(done, expected, atol=0.01, rtol=0)
 
 
 def test_the_policy_learns_to_do_what_the_teacher_does(tmp_path) -> None:
     algorithm = collected(tmp_path, ToyVectorEnv(snapshots=True))
-    seen = algorithm._seen(*algorithm._rows())
+    seen = algorithm._policy_batch(*algorithm._rows())
 
     def off():
         with torch.no_grad():
-            shown = algorithm._taught(seen).mean
+            shown = algorithm._teacher_policy(seen).mean
             done = algorithm.agent.policy(seen)
             return float((shown - done).square().mean())
 
     before, algorithm.share = off(), 0.5
     for _ in range(60):
-        algorithm._imitate()
+        algorithm._train_policy()
     assert off() < 0.3 * before
 
 
@@ -236,7 +236,7 @@ def test_the_first_value_of_a_discounted_reward_is_the_reward(tmp_path) -> None:
     for _ in range(150):
         algorithm._improve_critics(algorithm._draw())
     drawn = algorithm._draw()
-    value = algorithm.critics(algorithm._known(drawn), drawn["action"])
+    value = algorithm.critics(algorithm._critic_input(drawn), drawn["action"])
     off = value - algorithm.config.reward_scale * drawn["reward"]
     assert off.abs().mean() < 0.1
 

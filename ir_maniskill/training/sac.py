@@ -47,26 +47,26 @@ from ir_maniskill.training.schedules import linear
 
 log = logging.getLogger(__name__)
 
-TEMPERATURE = 0.03
+INITIAL_TEMPERATURE = 0.03
 """Weight of the entropy at the start."""
 TEMPERATURE_RATE = 1e-3
 """Adam's learning rate of its logarithm."""
-ENTROPY = (0.25, -0.75)
+TARGET_ENTROPY = (0.25, -0.75)
 """Entropy of each number of an action that the temperature aims at, in the first third
 of the teacher's training and at its end [nat]."""
 WARMUP = 0.03
 """Share of a training in which the learning rate grows."""
-LONGEST = 10.0
+MAX_GRAD_NORM = 10.0
 """Longest gradient of a step."""
 LOGGED = 64
 """Updates from one row of the log to the next."""
 WIDTHS = (384, 384)
 """Units of each critic's layers."""
-PARTS = ("agent", "critics", "slow", "teacher", "replay")
+PARTS = ("agent", "critics", "target_critics", "teacher", "replay")
 """What of the algorithm is in a checkpoint, beside optimizers and numbers."""
 
 
-def in_16_bits() -> torch.autocast:
+def bfloat16_autocast() -> torch.autocast:
     """Return a context that multiplies in 16 bits where that is faster."""
     known = getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)
     return torch.autocast("cpu", torch.bfloat16, enabled=known())
@@ -86,7 +86,7 @@ class Critics(nn.Module):
         """Return both values [2, B] of what is known [B, D] and done [B, A]."""
         x = torch.cat([known, action], dim=1).expand(2, -1, -1)
         *hidden, last = zip(self.weights, self.biases, strict=True)
-        with in_16_bits():
+        with bfloat16_autocast():
             for weight, bias in hidden:
                 x = torch.baddbmm(bias, x, weight)
                 x = functional.relu(functional.layer_norm(x, x.shape[-1:]))
@@ -144,12 +144,13 @@ class SAC(Algorithm):
         read = self.agent.encoder.language.reads
         self._sentence = {name: state[name].shape[1] for name in read}
         self.pursuit = Pursuit(self.hindsight, len(state["instruction"]))
-        inputs = self._known(self._simulated(state)).shape[1]
+        inputs = self._critic_input(self._privileged(state)).shape[1]
         gain = config.agent.posture_gain
         self.teacher = SquashedActor(inputs, WIDTHS, actions, posture_gain=gain)
         self.critics = Critics(inputs + actions)
-        self.slow = copy.deepcopy(self.critics).requires_grad_(False)
-        self.log_temperature = torch.tensor(math.log(TEMPERATURE), requires_grad=True)
+        self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
+        start = math.log(INITIAL_TEMPERATURE)
+        self.log_temperature = torch.tensor(start, requires_grad=True)
         rate = self.config.learning_rate
         self._optimizers = {
             "agent": adam(self.agent.parameters(), self.config.policy_rate),
@@ -162,7 +163,7 @@ class SAC(Algorithm):
         self._history: dict[str, list[Tensor]] = defaultdict(list)
         self._past: list[State] = []
         """Steps of all envs whose episodes go on, the oldest first."""
-        self._began: Tensor
+        self._episode_start: Tensor
         """Of each env, which of them its episode began with."""
         self.restart()
 
@@ -176,24 +177,24 @@ class SAC(Algorithm):
         the policy gets to; these are the more, the longer the training has lasted.
         """
         count = len(state["instruction"])
-        told = self._simulated(state)  # also while it is not needed
+        told = self._privileged(state)  # also while it is not needed
         if self.replay.written < self.config.random_steps:
             action = torch.rand(count, self.actions) * 2 - 1
         else:
-            action, _ = self._taught(told).rsample()
-            by_policy = round(self.config.policy_acts * self._schooling * count)
+            action, _ = self._teacher_policy(told).rsample()
+            by_policy = round(self.config.policy_acts * self._policy_progress * count)
             if by_policy:
                 some = {name: value[:by_policy] for name, value in state.items()}
                 action[:by_policy] = self.agent.policy(some)
         self._past.append({**self._kept(state), "action": action})
         return action
 
-    def _taught(self, read: State) -> Squashed:
+    def _teacher_policy(self, read: State) -> Squashed:
         """Return what the teacher would do [N, A]."""
-        with in_16_bits():
-            return self.teacher(self._known(read), read["now.target"])
+        with bfloat16_autocast():
+            return self.teacher(self._critic_input(read), read["now.target"])
 
-    def _simulated(self, state: State) -> State:
+    def _privileged(self, state: State) -> State:
         """Return what critics read of a state, before it is put together."""
         scene = self._scene(state["snapshot"])
         goal = self.pursuit.look(scene, state["text"])
@@ -215,7 +216,7 @@ class SAC(Algorithm):
         assert outcome.final is not None
         final = self._kept(outcome.final)
         for env in ended:
-            rows = self._past[int(self._began[env]) :]
+            rows = self._past[int(self._episode_start[env]) :]
             episode = {
                 name: torch.stack([*(row[name][env] for row in rows), value[env]])
                 for name, value in final.items()
@@ -226,15 +227,16 @@ class SAC(Algorithm):
             terminal[-1] = outcome.terminated[env]
             self._keep({**episode, "terminal": terminal})
         self.pursuit.forget(ended)
-        self._began[ended] = len(self._past)
-        oldest = int(self._began.min())
-        self._past, self._began = self._past[oldest:], self._began - oldest
+        self._episode_start[ended] = len(self._past)
+        oldest = int(self._episode_start.min())
+        self._past = self._past[oldest:]
+        self._episode_start -= oldest
 
     def _keep(self, episode: State) -> None:
         """Keep an episode, for a policy also as a mirror shows it, if that is known."""
         (said,) = read_text(episode.pop("text")[:1])
         self._add(episode, said)
-        if self.mirror is not None and self._schooling > 0:
+        if self.mirror is not None and self._policy_progress > 0:
             self._add(self.mirror(episode), None)
 
     def _add(self, episode: State, said: str | None) -> None:
@@ -259,7 +261,7 @@ class SAC(Algorithm):
     def restart(self) -> None:
         """Forget the episodes that were not seen to end."""
         self._past = []
-        self._began = torch.zeros(self.pursuit.envs, dtype=torch.int64)
+        self._episode_start = torch.zeros(self.pursuit.envs, dtype=torch.int64)
         self.pursuit.forget(range(self.pursuit.envs))
 
     # -- Learning --------------------------------------------------------------------
@@ -269,11 +271,11 @@ class SAC(Algorithm):
         if self.replay.written < self.config.random_steps:
             return {}
         self.updates += 1
-        if self._schooling > 0:
+        if self._policy_progress > 0:
             for _ in range(self.config.imitations):
-                self._imitate()
+                self._train_policy()
         else:
-            self._teach()
+            self._train_teacher()
         if self.updates % LOGGED:
             return {}
         history = sorted(self._history.items())  # a table's columns keep their order
@@ -297,7 +299,7 @@ class SAC(Algorithm):
         drawn["terminal"] = replay.read("terminal", after)
         return drawn
 
-    def _seen(self, rows: Tensor, which: Tensor) -> State:
+    def _policy_batch(self, rows: Tensor, which: Tensor) -> State:
         """Return states as the policy perceives them, and the truth."""
         replay = self.replay
         seen = {
@@ -326,16 +328,16 @@ class SAC(Algorithm):
     def _scene(self, rows: Tensor) -> Snapshot:
         return Snapshot.unpack(rows, self.hindsight.fingers)
 
-    def _known(self, read: State) -> Tensor:
+    def _critic_input(self, read: State) -> Tensor:
         """Return what critics and teacher read [B, D]."""
         speed = (read["joint_velocity"] / 10).clamp(-1, 1)
         felt = read["now.target"], read["now.proprioception"]
         return torch.cat([*felt, speed, read["goal"]], dim=1)
 
-    def _teach(self) -> None:
+    def _train_teacher(self) -> None:
         """Improve critics and teacher by a step of all envs."""
         for name in ("critics", "teacher"):
-            self._set_rate(name, self.config.learning_rate, self._learned)
+            self._set_rate(name, self.config.learning_rate, self._teacher_progress)
         for turn in range(self.config.gradients):
             now = self._draw()
             self._improve_critics(now)
@@ -347,38 +349,38 @@ class SAC(Algorithm):
         temperature = self.log_temperature.detach().exp()
         with torch.no_grad():
             after = under("next", now)
-            action, log_prob = self._taught(after).rsample()
-            future = self.slow(self._known(after), action).amin(dim=0)
+            action, log_prob = self._teacher_policy(after).rsample()
+            future = self.target_critics(self._critic_input(after), action).amin(dim=0)
             future = (future - temperature * log_prob) * ~now["terminal"]
             scale, gamma = self.config.reward_scale, self.config.gamma
             target = scale * now["reward"] + gamma * future
-        value = self.critics(self._known(now), now["action"])
+        value = self.critics(self._critic_input(now), now["action"])
         loss = functional.mse_loss(value, target.expand_as(value), reduction="sum")
         loss = loss / len(target)
         self._descend("critics", loss)
         with torch.no_grad():
             rate = self.config.polyak
-            slow, fast = self.slow.parameters(), self.critics.parameters()
-            torch._foreach_lerp_(list(slow), list(fast), rate)
+            weights = list(self.critics.parameters())
+            torch._foreach_lerp_(list(self.target_critics.parameters()), weights, rate)
         self._note(critics=loss, value=value.mean(), reward=now["reward"].mean())
 
     def _improve_teacher(self, now: State) -> None:
         """Do what both critics value, as randomly as the target entropy asks."""
         temperature = self.log_temperature.detach().exp()
-        action, log_prob = self._taught(now).rsample()
-        value = self.critics(self._known(now), action).amin(dim=0)
+        action, log_prob = self._teacher_policy(now).rsample()
+        value = self.critics(self._critic_input(now), action).amin(dim=0)
         self._descend("teacher", (temperature * log_prob - value).mean())
-        entropy = linear(*ENTROPY, max(0.0, 1.5 * self._learned - 0.5))
+        entropy = linear(*TARGET_ENTROPY, max(0.0, 1.5 * self._teacher_progress - 0.5))
         excess = -entropy * self.actions - log_prob.detach().mean()
         self._descend("temperature", self.log_temperature.exp() * excess)
         self._note(entropy=-log_prob.mean(), temperature=temperature)
 
-    def _imitate(self) -> None:
+    def _train_policy(self) -> None:
         """Do what the teacher does, and tell where the named object is."""
         rows, which = self._rows()
-        self._set_rate("agent", self.config.policy_rate, self._schooling)
+        self._set_rate("agent", self.config.policy_rate, self._policy_progress)
         means = backward(
-            lambda part: self._imitation(self._seen(rows[part], which[part])),
+            lambda part: self._imitation(self._policy_batch(rows[part], which[part])),
             len(rows),
             self._weights("agent"),
             self._threads,
@@ -389,9 +391,9 @@ class SAC(Algorithm):
     def _imitation(self, now: State) -> Loss:
         """Return how far the policy is off the teacher and the truth."""
         with torch.no_grad():
-            shown = self._taught(now).mean
+            shown = self._teacher_policy(now).mean
         encoder, scene = self.agent.encoder, self._scene(now["snapshot"])
-        with in_16_bits():
+        with bfloat16_autocast():
             aligned = encoder(now)
             mean = self.agent.actor(aligned, now["now.target"]).mean
         loss = functional.mse_loss(mean, shown)
@@ -408,12 +410,12 @@ class SAC(Algorithm):
         return loss, means
 
     @property
-    def _learned(self) -> float:
+    def _teacher_progress(self) -> float:
         """Which share of its own training the teacher has behind it."""
         return min(1.0, self.share / self.config.policy_from)
 
     @property
-    def _schooling(self) -> float:
+    def _policy_progress(self) -> float:
         """Which share of its own training the policy has behind it."""
         begun = self.config.policy_from
         return max(0.0, (self.share - begun) / (1 - begun))
@@ -435,7 +437,7 @@ class SAC(Algorithm):
 
     def _step(self, name: str) -> None:
         """Make one step of an optimizer."""
-        nn.utils.clip_grad_norm_(self._weights(name), LONGEST)
+        nn.utils.clip_grad_norm_(self._weights(name), MAX_GRAD_NORM)
         self._optimizers[name].step()
 
     def _note(self, **figures: Tensor) -> None:
