@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.distributions import Normal, TanhTransform, TransformedDistribution
 from torch.nn import functional
-from toy_envs import HANDS, LENGTH, TASK, ToyVectorEnv, toy_sac
+from toy_envs import HANDS, LENGTH, TASK, ToyVectorEnv, steps_of, toy_sac
 
 from ir_maniskill.agent.actor import Squashed
 from ir_maniskill.checks import ConfigError
@@ -193,6 +193,14 @@ def test_the_policy_learns_to_do_what_the_teacher_does(tmp_path) -> None:
     for _ in range(60):
         algorithm._train_policy()
     assert off() < 0.3 * before
+
+
+def test_the_policy_is_not_evaluated_before_it_learns(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(runner, "FINAL_EPISODES", 8)
+    learner = dataclasses.replace(toy_sac(tmp_path).sac, policy_from=0.5)
+    learn(tmp_path, 2000, sac=learner, eval_interval=250)
+    assert len(steps_of(tmp_path)) > len(steps_of(tmp_path, "evaluations")) > 1
+    assert steps_of(tmp_path, "evaluations")[0] > 1000
 
 
 def test_every_episode_is_kept_whole(tmp_path) -> None:

@@ -56,6 +56,11 @@ class Algorithm(ABC):
     learns_while_stepping: ClassVar[bool] = False
     """Whether `update` may come while the envs step, before `observe`."""
 
+    @property
+    def has_policy(self) -> bool:
+        """Whether `agent` has begun to learn; before that it is not evaluated."""
+        return True
+
     @staticmethod
     def device() -> torch.device:
         """Return where states are given to it, and where it learns."""

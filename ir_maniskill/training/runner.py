@@ -242,7 +242,8 @@ class Runner:
     def _evaluation_is_due(self) -> bool:
         """Whether a multiple of the interval, or the end, is not evaluated yet."""
         ended = self.steps >= self.config.total_steps and self.steps > self.evaluated
-        return ended or self._due(self.config.eval_interval, self.evaluated)
+        due = self._due(self.config.eval_interval, self.evaluated)
+        return ended or (due and self.algorithm.has_policy)
 
     def _due(self, interval: int, before: int) -> bool:
         """Whether a multiple of the interval was passed since that many steps."""

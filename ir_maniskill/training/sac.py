@@ -113,6 +113,11 @@ class SAC(Algorithm):
 
     learns_while_stepping = True
 
+    @property
+    def has_policy(self) -> bool:
+        """Whether the teacher is done, so that the policy learns."""
+        return self._policy_progress > 0
+
     @staticmethod
     def device() -> torch.device:
         """Return the CPU: the replay is in files, and the networks are small."""
@@ -236,7 +241,7 @@ class SAC(Algorithm):
         """Keep an episode, for a policy also as a mirror shows it, if that is known."""
         (said,) = read_text(episode.pop("text")[:1])
         self._add(episode, said)
-        if self.mirror is not None and self._policy_progress > 0:
+        if self.mirror is not None and self.has_policy:
             self._add(self.mirror(episode), None)
 
     def _add(self, episode: State, said: str | None) -> None:
@@ -271,7 +276,7 @@ class SAC(Algorithm):
         if self.replay.written < self.config.random_steps:
             return {}
         self.updates += 1
-        if self._policy_progress > 0:
+        if self.has_policy:
             for _ in range(self.config.imitations):
                 self._train_policy()
         else:
