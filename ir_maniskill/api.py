@@ -251,7 +251,7 @@ def _prepare(
     experiment = catalog.get(task or policy.env_id)
     policy.require_match(experiment, env_kwargs.get("robot_uids"), any_task=any_task)
     wanted = None if instruction is None else [instruction]
-    experiment = experiment.in_split(env_kwargs.get("split"))
+    experiment = experiment.in_split(*map(env_kwargs.get, ("split", "kinds")))
     for said in choose_instructions(experiment, wanted):
         if said is not None and not isinstance(experiment.instructions, Spoken):
             experiment.check_refs(said)

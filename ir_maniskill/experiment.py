@@ -12,7 +12,7 @@ import math
 import os
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from numbers import Integral, Real
@@ -302,18 +302,28 @@ class Experiment:
             return Spoken.MAX_TOKENS
         return max(len(split_words(sentence)) for sentence in self.sentences)
 
-    def in_split(self, split: str | None) -> Experiment:
+    def in_split(
+        self, split: str | None = None, kinds: Sequence[str] | None = None
+    ) -> Experiment:
         """Return the same with the sentences and places of a split; None: its own.
 
+        `kinds` are those of its sentences to draw, each as often as it stands there.
+
         Raises:
-            ExperimentError: There is no such split, or the sentences are not spoken.
+            ExperimentError: There is no such split or kind, or the sentences are not
+                spoken.
         """
-        if split is None:
+        own = self.instructions
+        if not isinstance(own, Spoken):
+            fits, none = split in (None, "train"), "'train': it has none"
+            _require(fits, f"split of {self.id}", split, none)
+            _require(kinds is None, f"kinds of {self.id}", kinds, "None: it has none")
             return self
-        if isinstance(self.instructions, Spoken):
-            return replace(self, instructions=replace(self.instructions, split=split))
-        _require(split == "train", f"split of {self.id}", split, "'train': it has none")
-        return self
+        for kind in kinds or ():
+            _require_choice(f"kind of {self.id}", kind, own.kinds)
+        kinds = own.kinds if kinds is None else tuple(kinds)
+        spoken = replace(own, split=split or own.split, kinds=kinds)
+        return replace(self, instructions=spoken)
 
     def _check_vocabulary(self) -> None:
         _require_tuple("vocabulary", self.vocabulary, str)

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ir_maniskill import experiment as catalog
 from ir_maniskill.environment.reward_generator import RewardWeights
 from ir_maniskill.training.config import (
     CONFIGS,
@@ -16,6 +17,7 @@ from ir_maniskill.training.config import (
     leaves,
     to_data,
 )
+from ir_maniskill.training.train import for_experiment
 
 
 def through_json(config):
@@ -138,6 +140,18 @@ def test_whatever_a_config_says_it_is_a_config_or_refused(draw, value):
         return
     assert through_json(config) == config
     assert config.steps_per_env > 0
+
+
+def test_a_task_is_trained_on_those_kinds_that_it_has():
+    config = dataclasses.replace(CONFIGS["listen"], kinds=("push", "touch", "push"))
+    cases = {"NaoInstruct-v1": config.kinds, "NaoInstructPush-v1": ("push", "push")}
+    for task, kinds in (cases | {"NaoTouchCubeSingle-v1": None}).items():
+        made = for_experiment(config, catalog.get(task))
+        assert made.kinds == kinds
+        assert made.env_kwargs(training=True).get("kinds") == kinds
+        assert "kinds" not in made.env_kwargs(training=False)  # it is evaluated on all
+    with pytest.raises(ConfigError, match="kinds: got .*'psh'.*, expected some of"):
+        dataclasses.replace(config, kinds=("psh",))
 
 
 def test_the_leaves_of_a_config_are_all_its_numbers():

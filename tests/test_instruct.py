@@ -1,5 +1,6 @@
 """Free scenes and spoken sentences: what holds for all ids and splits."""
 
+from collections import Counter
 from collections.abc import Iterator
 from itertools import compress
 
@@ -287,6 +288,15 @@ def test_a_robot_with_one_hand_is_told_what_one_hand_can_do() -> None:
     assert not {kind_of(each.goal) for each in said} & {"hand", "both"}
 
 
+def test_kinds_come_as_often_as_they_are_named() -> None:
+    task = instruct.ALL.in_split(kinds=("push", "push", "touch"))
+    streams = [np.random.RandomState(seed) for seed in range(90)]
+    *_, said = Speaker(task, layout_of(task, Nao)).draw(streams)
+    found = Counter(kind_of(each.goal) for each in said)
+    assert found.keys() == {"push", "touch"}
+    assert 45 < found["push"] < 75  # of 60, give or take 3.4 standard deviations
+
+
 # -- Bad input -------------------------------------------------------------------------
 
 
@@ -297,6 +307,10 @@ def test_a_split_that_there_is_not_is_refused() -> None:
         ir_maniskill.make_vec("NaoInstruct-v1", 2, split="test")
     with pytest.raises(ExperimentError, match="split of .*Single.*: got 'places'"):
         catalog.get("NaoTouchCubeSingle-v1").in_split("places")
+    with pytest.raises(ExperimentError, match="kind of .*: got 'then', available: t"):
+        ir_maniskill.make_vec("NaoInstruct-v1", 2, kinds=("touch", "then"))
+    with pytest.raises(ExperimentError, match="kinds of .*Single.*: got .*'touch'"):
+        catalog.get("NaoTouchCubeSingle-v1").in_split(kinds=("touch",))
 
 
 @pytest.mark.parametrize(

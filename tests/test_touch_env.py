@@ -136,6 +136,7 @@ def test_shader_packs_that_cannot_draw_are_refused(mode, pack, message) -> None:
     ("wrong", "message"),
     [
         ({"num_envs": 2, "sim_backend": "physx_cpu"}, "got 2, .*make_vec"),
+        ({"sim_backend": "x"}, "sim_backend: got 'x', expected 'auto' or one of cpu"),
         ({"experiment": "NaoTouchCubeSolo-v1"}, "'NaoTouchCubeSolo-v1', available: N"),
         ({"experiment": None}, "task id: got None, expected a str"),
         ({"num_envs": 0}, "num_envs: got 0, expected a whole number, at least 1"),

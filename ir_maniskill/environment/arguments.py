@@ -1,4 +1,4 @@
-"""What vector envs are given, checked before any env hears of it. Legend: N envs."""
+"""What envs are given, checked before any env hears of it. Legend: N envs."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from mani_skill.envs.utils.system.backend import sim_backend_name_mapping
 from torch import Tensor
 
+from ir_maniskill.checks import require
 from ir_maniskill.environment.senses import text_of
 from ir_maniskill.experiment import Experiment, Spoken
 from ir_maniskill.goals import GoalError, Instruction
@@ -22,6 +24,25 @@ RESET_OPTIONS = ("instruction", "reconfigure", "reset_to_env_states")
 
 SEEDS = range(2**32)
 """Seeds of NumPy's random streams, from which ManiSkill draws."""
+
+
+def simulator_of(sim_backend: str) -> str:
+    """Return the first of ManiSkill's names of a backend, without the device.
+
+    "auto" is CUDA where torch sees a device.
+
+    Raises:
+        ConfigError: There is no such backend, or no CUDA device.
+    """
+    names, cuda = sim_backend_name_mapping, torch.cuda.is_available()
+    if sim_backend == "auto":
+        return "physx_cuda" if cuda else "physx_cpu"
+    kind, _, _ = str(sim_backend).partition(":")
+    expected = f"'auto' or one of {', '.join(names)}, with a device if need be "
+    require(kind in names, "sim_backend", sim_backend, expected + "('cuda:0')")
+    fits, expected = cuda or names[kind] == "physx_cpu", "'physx_cpu': torch sees no "
+    require(fits, "sim_backend", sim_backend, expected + "CUDA device here")
+    return names[kind]
 
 
 def seeds_of(seed: int | Sequence[int], num_envs: int) -> list[int]:

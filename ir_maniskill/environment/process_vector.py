@@ -74,7 +74,9 @@ class ProcessVectorEnv(VectorEnv):
         self.num_envs, self._timeout = num_envs, timeout
         self.env_kwargs = env_kwargs or {}
         """What the envs were made with."""
-        self.experiment = experiment.in_split(self.env_kwargs.get("split"))
+        self.experiment = experiment.in_split(
+            *map(self.env_kwargs.get, ("split", "kinds"))
+        )
         self._rows = [r.tolist() for r in np.array_split(np.arange(num_envs), workers)]
         self._pipes: list[Connection] = []
         self._processes: list[mp.process.BaseProcess] = []

@@ -27,6 +27,7 @@ from ir_maniskill.environment.arguments import (
     instructions_of,
     require_reset,
     seeds_of,
+    simulator_of,
 )
 from ir_maniskill.environment.instructional_set import GoalBatch, InstructionalSet
 from ir_maniskill.environment.layout import layout_of
@@ -89,6 +90,7 @@ class TouchEnv(RenderedEnv):
         reward_weights: dict[str, float] | None = None,
         observe: Sequence[str] = (),
         split: str | None = None,
+        kinds: Sequence[str] | None = None,
         **kwargs: Any,
     ) -> None:
         """Build the env.
@@ -103,6 +105,8 @@ class TouchEnv(RenderedEnv):
             observe: What to observe beside the usual: "text" is the sentence's bytes.
             split: Of a task with `Spoken` instructions: "train", or what is held out
                 of it, "wording", "objects", "pairs" or "places"; None: its own.
+            kinds: Of such a task: the kinds of sentences to draw, each as often as it
+                stands here; None: each equally often.
             *args: As for `BaseEnv`.
             **kwargs: As for `BaseEnv`.
 
@@ -114,7 +118,7 @@ class TouchEnv(RenderedEnv):
                 is nothing of that name to observe.
             RuntimeError: No Vulkan device can render here; says what to install.
         """
-        self.experiment = catalog.get(experiment).in_split(split)
+        self.experiment = catalog.get(experiment).in_split(split, kinds)
         _require_one_on_cpu(kwargs)
         robot = robot_class(robot_uids)
         if not isinstance(robot_uids, type):
@@ -525,10 +529,9 @@ class TouchEnv(RenderedEnv):
 
 def _require_one_on_cpu(kwargs: dict[str, Any]) -> None:
     """Raise if several envs are asked for where physics can only be on the CPU."""
-    count, backend = kwargs.get("num_envs", 1), str(kwargs.get("sim_backend", "auto"))
+    count, backend = kwargs.get("num_envs", 1), kwargs.get("sim_backend", "auto")
     require_whole("num_envs", count, 1)
-    on_cpu = not torch.cuda.is_available() or "cpu" in backend
-    if count > 1 and on_cpu:
+    if simulator_of(backend) == "physx_cpu" and count > 1:
         raise ValueError(
             f"num_envs: got {count}, expected 1 with physics on the CPU; "
             "`ir_maniskill.make_vec(id, num_envs)` runs several in worker processes"

@@ -12,13 +12,17 @@ from typing import Any
 
 import gymnasium as gym
 import torch
-from mani_skill.envs.utils.system.backend import sim_backend_name_mapping
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 from torch import Tensor
 
 from ir_maniskill import experiment as catalog
 from ir_maniskill.checks import require, require_whole
-from ir_maniskill.environment.arguments import RESET_OPTIONS, require_names, seeds_of
+from ir_maniskill.environment.arguments import (
+    RESET_OPTIONS,
+    require_names,
+    seeds_of,
+    simulator_of,
+)
 from ir_maniskill.environment.process_vector import ProcessVectorEnv, Step, final_infos
 
 
@@ -55,22 +59,11 @@ def make_vec(
         require_whole("num_workers", num_workers, 1)
     waits = isinstance(timeout, float | int) and timeout > 0
     require(waits, "timeout", timeout, "more than 0 [s]")
-    if sim_backend == "auto":
-        sim_backend = "physx_cuda" if torch.cuda.is_available() else "physx_cpu"
-    if _simulator(sim_backend) == "physx_cuda":
-        expected = "'physx_cpu': torch sees no CUDA device here"
-        require(torch.cuda.is_available(), "sim_backend", sim_backend, expected)
-        return GpuVectorEnv(task_id, num_envs, sim_backend=sim_backend, **env_kwargs)
+    if (simulator := simulator_of(sim_backend)) == "physx_cuda":
+        # ManiSkill takes "auto" for the cores where there is one env.
+        named = simulator if sim_backend == "auto" else sim_backend
+        return GpuVectorEnv(task_id, num_envs, sim_backend=named, **env_kwargs)
     return ProcessVectorEnv(experiment, num_envs, num_workers, env_kwargs, timeout)
-
-
-def _simulator(sim_backend: str) -> str:
-    """Return the first of ManiSkill's names of a backend, without the device."""
-    kind, _, _ = str(sim_backend).partition(":")
-    known = ", ".join(sim_backend_name_mapping)
-    expected = f"'auto' or one of {known}, with a device if need be ('cuda:0')"
-    require(kind in sim_backend_name_mapping, "sim_backend", sim_backend, expected)
-    return sim_backend_name_mapping[kind]
 
 
 class GpuVectorEnv(ManiSkillVectorEnv):

@@ -10,6 +10,7 @@ from ir_maniskill.agent.agent import asks
 from ir_maniskill.agent.config import AgentConfig
 from ir_maniskill.checks import ConfigError, require, require_fields, require_types
 from ir_maniskill.environment.reward_generator import RewardWeights
+from ir_maniskill.language.splits import KINDS
 
 ControlMode = Literal["pd_joint_target_delta_pos", "pd_joint_pos"]
 RewardMode = Literal["dense", "sparse"]
@@ -111,7 +112,7 @@ class SACConfig:
     reward_scale: float = 0.2
     """Factor of rewards, beside which entropy counts."""
     polyak: float = 0.005
-    """How far the slow critics follow at each gradient."""
+    """How far the target critics follow at each gradient."""
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
@@ -176,6 +177,9 @@ class TrainConfig:
     """Steps from one evaluation to the next."""
     eval_episodes: int = 90
     """Episodes of each evaluation, spread evenly over the instructions."""
+    kinds: tuple[str, ...] | None = None
+    """Kinds of spoken sentences to learn from, each as often as it stands here, if the
+    task has it; None: each equally often."""
     checkpoint_interval: int = 20_000
     """Steps from one complete checkpoint to the next."""
     agent: AgentConfig = field(default_factory=lambda: AgentConfig(posture_gain=1.0))
@@ -196,6 +200,8 @@ class TrainConfig:
         require_fields(self, positive, lambda x: x is None or x > 0, "at least 1")
         require_fields(self, "penalty_warmup", lambda x: 0 <= x <= 1, "0 to 1")
         require_fields(self, "seed", lambda x: 0 <= x < 2**31, "0 to 2**31 - 1")
+        known = self.kinds is None or {*KINDS} >= {*self.kinds} > set()
+        require(known, "kinds", self.kinds, f"some of {KINDS}, or None")
         gain = self.agent.posture_gain
         fits = gain == 0 or self.control_mode == "pd_joint_target_delta_pos"
         expected = "0 where actions do not change the joint targets (control_mode)"
@@ -248,6 +254,8 @@ class TrainConfig:
         if asked:
             kwargs["observe"] = asked
         if training:
+            if self.kinds is not None:
+                kwargs["kinds"] = self.kinds
             kwargs["reward_mode"] = self.reward_mode
             kwargs["reward_weights"] = dataclasses.asdict(self.reward_weights)
         return kwargs
@@ -259,6 +267,7 @@ CONFIGS: dict[str, TrainConfig] = {
         algorithm="sac",
         total_steps=880_000,
         eval_interval=100_000,
+        kinds=("touch", "hand", *("where", "both", "then") * 2, *("push",) * 4),
         frames=1,
         penalty_warmup=0.0,
         reward_weights=RewardWeights(

@@ -99,7 +99,7 @@ class Hindsight:
     @classmethod
     def of(cls, config: TrainConfig, others: int) -> Hindsight:
         """Return that of a training's task and robot."""
-        experiment = catalog.get(config.env_id)
+        experiment = catalog.get(config.env_id).in_split(kinds=config.kinds)
         robot = robot_class(config.robot)
         dense = config.reward_mode == "dense"
         weights = config.reward_weights.vector() if dense else None

@@ -365,8 +365,8 @@ class SAC(Algorithm):
         self._descend("critics", loss)
         with torch.no_grad():
             rate = self.config.polyak
-            weights = list(self.critics.parameters())
-            torch._foreach_lerp_(list(self.target_critics.parameters()), weights, rate)
+            slow, fast = self.target_critics.parameters(), self.critics.parameters()
+            torch._foreach_lerp_(list(slow), list(fast), rate)
         self._note(critics=loss, value=value.mean(), reward=now["reward"].mean())
 
     def _improve_teacher(self, now: State) -> None:

@@ -18,7 +18,7 @@ from ir_maniskill.agent.language_system import encoder_of
 from ir_maniskill.checks import require, require_choice
 from ir_maniskill.environment.robots.robot import robot_class
 from ir_maniskill.environment.vector import VectorEnv, make_vec
-from ir_maniskill.experiment import Experiment
+from ir_maniskill.experiment import Experiment, Spoken
 from ir_maniskill.policy import load_policy
 from ir_maniskill.training import distributed
 from ir_maniskill.training.algorithm import Algorithm
@@ -179,7 +179,7 @@ def _give_weights(name: str, agent: Agent) -> None:
 
 
 def for_experiment(config: TrainConfig, experiment: Experiment) -> TrainConfig:
-    """Return the config with what the experiment decides: senses and vocabulary.
+    """Return the config with what the experiment decides: senses, words and kinds.
 
     An agent that reads any text keeps the words of the weights it begins with.
     """
@@ -187,7 +187,10 @@ def for_experiment(config: TrainConfig, experiment: Experiment) -> TrainConfig:
     if config.init_from and "instruction" not in encoder_of(config.agent).reads:
         words = config.agent.vocabulary
     agent = dataclasses.replace(config.agent, senses=senses, vocabulary=words)
-    return dataclasses.replace(config, agent=agent)
+    said = experiment.instructions
+    spoken = said.kinds if isinstance(said, Spoken) else ()
+    kinds = tuple(kind for kind in config.kinds or () if kind in spoken) or None
+    return dataclasses.replace(config, agent=agent, kinds=kinds)
 
 
 def _require_shares(config: TrainConfig) -> None:
