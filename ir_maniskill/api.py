@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from ir_maniskill import experiment as catalog
-from ir_maniskill.checks import require, require_choice, require_whole
+from ir_maniskill.checks import ConfigError, require, require_choice, require_whole
 from ir_maniskill.environment.arguments import SEEDS
 from ir_maniskill.environment.vector import make_vec
 from ir_maniskill.evaluation import audit as audits
@@ -116,7 +116,10 @@ def audit(
         player = player_of(policy.agent.policy, policy.config.frames)
         kwargs = policy.env_kwargs
     else:
-        experiment = catalog.get(task or "")
+        if task is None:
+            expected = "an id: a function does not say what it was trained for"
+            raise ConfigError(f"task: got None, expected {expected}")
+        experiment = catalog.get(task)
         player = _player(policy)
         kwargs = PICTURES | getattr(policy, "env_kwargs", {})
     return audits.audit(

@@ -101,7 +101,7 @@ def run(seconds: float = 10.0, quick: bool = False) -> Report:
         quick: Whether to measure as briefly as possible, without the peer, which takes
             long to load.
     """
-    require(0 < seconds <= 600, "seconds", seconds, "up to 600")
+    require(0 < seconds <= 600, "seconds", seconds, "more than 0, at most 600")
     seconds = 1.0 if quick else seconds
     jobs = (
         one_env("state", seconds, peer=not quick),

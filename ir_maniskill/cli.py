@@ -20,7 +20,7 @@ from tyro.conf import Positional, arg, subcommand
 
 from ir_maniskill import api, bench, doctor
 from ir_maniskill import experiment as catalog
-from ir_maniskill.checks import ConfigError, require
+from ir_maniskill.checks import ConfigError, require, require_choice
 from ir_maniskill.environment.robots.robot import Robot, available_robots, short_name
 from ir_maniskill.evaluation import dataset, plots, video
 from ir_maniskill.evaluation.evaluate import EVALUATION_SEED, write_report
@@ -266,8 +266,7 @@ class Record(_Play):
         """Play and keep."""
         task = catalog.get(self.env_id).id
         out = self.out or Path("runs") / f"{task}-{self.format}"
-        more = ("instruction", "episodes", "failures", "height")
-        options = self.options(*more)
+        options = self.options("instruction", "episodes", "failures", "height")
         kept = api.collect(self.policy_file(), out, task, form=self.format, **options)
         print(f"{kept} of {self.episodes} episodes are in {out}.")
         if kept < self.episodes:
@@ -405,10 +404,11 @@ def run(arguments: Sequence[str]) -> int:
 def _in_one_line(error: Exception) -> str:
     """Return an error's message, without a traceback that a worker sent along."""
     message = str(error) or type(error).__name__
-    if "Traceback" not in message:
+    head, _, trace = message.partition("Traceback")
+    if not trace:
         return message
-    lines = message.splitlines()
-    return f"{lines[0]} {lines[-1]}"
+    told = trace.rpartition("\n  ")[2].partition("\n")[2]  # after the last frame
+    return f"{head.strip()} {told.strip()}"
 
 
 def parse(arguments: Sequence[str]) -> Any:
@@ -421,8 +421,7 @@ def parse(arguments: Sequence[str]) -> Any:
     ahead = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     ahead.add_argument("--preset", nargs="?")
     preset = ahead.parse_known_args(list(arguments))[0].preset
-    if preset is not None and preset not in CONFIGS:
-        raise ConfigError(f"--preset: got {preset!r}, available: {', '.join(CONFIGS)}")
+    require_choice("--preset", preset or "default", CONFIGS)
     defaults = CONFIGS[preset or "default"]
     command = _parse(arguments, defaults)
     if not isinstance(command, Train):

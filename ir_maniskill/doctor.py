@@ -52,7 +52,8 @@ NVIDIA_ADVICE = (
     "An NVIDIA driver is here, but not its Vulkan part. Install the driver's graphics "
     "libraries (libnvidia-gl-...); in a container set NVIDIA_DRIVER_CAPABILITIES=all. "
     "To render on the CPU instead, install mesa-vulkan-drivers (24.3 or newer) and set "
-    "VK_ICD_FILENAMES=/usr/share/vulkan/icd.d/lvp_icd.json."
+    "VK_ICD_FILENAMES=/usr/share/vulkan/icd.d/lvp_icd.json. If a library is missing, "
+    "install that: libx11-6, libgl1 or libglib2.0-0."
 )
 
 _PROBE = """
@@ -102,7 +103,9 @@ class Diagnosis:
     @property
     def healthy(self) -> bool:
         """Whether everything needed on the CPU is there."""
-        return self.render_error is None and None not in self.facts.values()
+        found = self.facts.values()
+        broken = None in found or any(str(fact).startswith("FAILS") for fact in found)
+        return self.render_error is None and not broken
 
     def __str__(self) -> str:
         device = self.render_device or ""
@@ -237,16 +240,16 @@ def _version(distribution: str) -> str | None:
         return None
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main(arguments: list[str]) -> int:
     """Print the diagnosis; return 0 if this machine can render, else 1.
 
     With `--commands` it prints only the shell commands to run.
     """
     diagnosis = diagnose()
-    commands = "--commands" in (sys.argv[1:] if arguments is None else arguments)
-    print("\n".join(diagnosis.remedy) if commands else diagnosis)
+    only = "--commands" in arguments
+    print("\n".join(diagnosis.remedy) if only else diagnosis)
     return 0 if diagnosis.healthy else 1
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(sys.argv[1:]))

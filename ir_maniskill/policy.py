@@ -142,8 +142,8 @@ class Policy:
             pairs |= {k: (then[k], now.get(k)) for k in then if then[k] != now.get(k)}
         if pairs:
             told = [_difference(name, *pair) for name, pair in pairs.items()]
-            if pairs.keys() == {"task"}:  # else that would not do
-                told.append("name its task, or say any_task (--any-task) to try it")
+            if not pairs.keys() & {"vocabulary", "robot"}:  # else that would not do
+                told.append("say any_task (--any-task) to try it")
             raise MismatchError(
                 f"policy trained for {self.env_id} does not fit {experiment.id}: "
                 + "; ".join(told)
@@ -209,16 +209,20 @@ def load_policy(
         CheckpointError: There is no such file, or it cannot be used.
     """
     path, name = Path(id_or_path), str(id_or_path)
-    if name in catalog.available() and shipped(name).exists():
+    if name in ships():
+        if path.exists():
+            raise CheckpointError(
+                f"policy: got {name!r}, which ships and lies in this folder, too; "
+                f"expected {name}/best.safetensors, or another working folder"
+            )
         path = shipped(name)
     if path.is_dir():
         path = path / "best.safetensors"
     if not path.exists():
-        ids = ", ".join(name for name in catalog.available() if shipped(name).exists())
         raise CheckpointError(
             f"policy: got {name!r}, expected an existing file, a run's "
             "folder with a best policy, or a task whose policy ships with the package: "
-            + ids
+            + ", ".join(ships())
         )
     agent, config, metadata = load_agent(path)
     chosen = device or ("cuda" if torch.cuda.is_available() else "cpu")
@@ -228,6 +232,11 @@ def load_policy(
 def shipped(task_id: str) -> Path:
     """Return where the policy of a task is, if it ships with the package."""
     return FOLDER / "policies" / f"{task_id}.safetensors"
+
+
+def ships() -> list[str]:
+    """Return the tasks whose policy ships."""
+    return [i for i in catalog.available() if shipped(i).is_file()]
 
 
 def _difference(name: str, got: Any, expected: Any) -> str:

@@ -203,6 +203,8 @@ def test_anybodys_function_is_audited_on_what_envs_observe(monkeypatch):
             ir_maniskill.audit(Mine(), TASK.id, num_envs=wrong)
     with pytest.raises(ValueError, match="policy: got .*, expected a function"):
         ir_maniskill.audit(audits, TASK.id)
+    with pytest.raises(ValueError, match="task: got None, expected an id"):
+        ir_maniskill.audit(Mine())
 
 
 def test_a_policy_is_not_audited_on_another_robot_or_one_split():

@@ -283,7 +283,7 @@ def policy_for(task):
 def test_a_policy_file_tells_task_words_robot_and_longest_sentence(task):
     facts = policy_for(task).metadata
     told = facts["config"]["agent"]
-    assert facts["env_id"] == "NaoTouchCubeTriangle-v1"
+    assert facts["config"]["env_id"] == "NaoTouchCubeTriangle-v1"
     assert told["vocabulary"] == list(task.vocabulary)
     assert (told["language_length"], facts["config"]["robot"]) == (16, "nao")
     assert facts["task"]["objects"][0]["is"] == "TouchObject"
@@ -304,11 +304,11 @@ def swapped(words):
         ),
         (
             lambda task: {"shuffled": True},
-            "Triangle-v1: shuffled: got False, expected True$",
+            "Triangle-v1: shuffled: got False, expected True; say any_task",
         ),
         (
             lambda task: {"episode_steps": 64, "reward": "binary"},
-            "reward: got .*'per_finger', expected 'binary'; episode_steps: got .*64$",
+            "reward: got .*'per_finger', expected 'binary'; episode_steps: got .*64; s",
         ),
         (
             lambda task: {"instructions": task.instructions[::-1]},

@@ -55,7 +55,9 @@ def test_a_crashing_probe_is_reported_not_suffered(monkeypatch):
 def test_a_torch_that_cannot_be_imported_is_told(monkeypatch):
     broken = doctor._PROBE.replace("import torch", "import torch_of_nobody")
     monkeypatch.setattr(doctor, "_PROBE", broken)
-    assert doctor.diagnose().facts["CUDA"].startswith("FAILS: ModuleNotFoundError")
+    diagnosis = doctor.diagnose()
+    assert diagnosis.facts["CUDA"].startswith("FAILS: ModuleNotFoundError")
+    assert not diagnosis.healthy
 
 
 def test_a_hanging_probe_is_given_up(monkeypatch):

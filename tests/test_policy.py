@@ -134,11 +134,15 @@ def test_a_path_is_a_path(tmp_path):
         assert ir_maniskill.load_policy(known).env_id == "NaoInstruct-v1"
 
 
-def test_what_cannot_be_loaded_says_what_can(tmp_path):
+def test_what_cannot_be_loaded_says_what_can(tmp_path, monkeypatch):
     with pytest.raises(CheckpointError, match=r"got 'Nao-v1', .*: .*CubeTriangle-v1"):
         ir_maniskill.load_policy("Nao-v1")
     with pytest.raises(CheckpointError, match="expected .* a run's folder with a best"):
         ir_maniskill.load_policy(tmp_path)
+    (tmp_path / TASK).mkdir()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(CheckpointError, match=f"{TASK}', which ships and lies in this"):
+        ir_maniskill.load_policy(TASK)
     with pytest.raises(ConfigError, match="policy: got .*`audit` takes any function"):
         ir_maniskill.evaluate(lambda obs: obs, TASK)
 

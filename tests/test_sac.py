@@ -203,6 +203,26 @@ def test_the_policy_is_not_evaluated_before_it_learns(tmp_path, monkeypatch) -> 
     assert steps_of(tmp_path, "evaluations")[0] > 1000
 
 
+def test_an_evaluation_that_is_interrupted_is_made_on_resuming(
+    tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr(runner, "FINAL_EPISODES", 8)
+    changes = {"eval_interval": 600, "checkpoint_interval": 600}
+    learn(tmp_path / "whole", 1200, **changes)
+
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(runner, "evaluate_policy", interrupt)
+        learn(tmp_path / "parts", 1200, **changes)
+    learn(tmp_path / "parts", 1200, resume=True, **changes)
+    whole, parts = (
+        steps_of(tmp_path / name, "evaluations") for name in ("whole", "parts")
+    )
+    assert parts == whole
+
+
 def test_every_episode_is_kept_whole(tmp_path) -> None:
     algorithm = collected(tmp_path, ToyVectorEnv(4, snapshots=True), episodes=3)
     assert algorithm.replay.episodes == 4 * 3

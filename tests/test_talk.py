@@ -5,6 +5,7 @@ import socket
 import sys
 import time
 from contextlib import closing
+from pathlib import Path
 from threading import Thread
 
 import numpy as np
@@ -21,7 +22,7 @@ from ir_maniskill.language import KINDS, kind_of, parse
 from ir_maniskill.language.tokens import VOCABULARY
 from ir_maniskill.talk import cards, film, live, meshes
 from ir_maniskill.talk.page import Page, side_by_side
-from ir_maniskill.talk.players import RANDOM, RandomMotion
+from ir_maniskill.talk.players import RANDOM, RandomMotion, fitting
 from ir_maniskill.talk.reading import LONGEST, clean, grounded, in_words, read
 from ir_maniskill.talk.session import Run, Score, Session
 from ir_maniskill.talk.stage import between
@@ -240,6 +241,8 @@ def test_where_no_policy_fits_chance_moves_the_robot(session):
 def test_a_policy_of_the_language_is_told_what_is_said(session):
     session.choose(task="NaoInstruct-v1")
     assert session.choice.policy == "NaoInstruct-v1"
+    players = fitting("NaoInstruct-v1", "nao", Path("NaoInstruct-v1"))
+    assert players[0] == "NaoInstruct-v1" and len({*players}) == len(players)
     *examples, _ = session.examples()
     assert {kind_of(parse(text)) for text in examples} <= set(KINDS) - {"then"}
     session.tell("Tap the crimson one")
@@ -296,6 +299,10 @@ def test_pictures_stand_in_the_middle_of_a_row():
     row = side_by_side([np.full((64, 32, 3), 255, np.uint8)])
     assert row.shape == (224, 366, 3)
     assert (row[:, 127:239] == 255).all() and (row[:, :127] < 255).all()
+    wide = np.full((64, 64, 3), 255, np.uint8)
+    row = side_by_side([wide, 0 * wide])  # each has half of the row
+    high = (row[:, 0] == 255).all(axis=1).sum()
+    assert (row == 255).all(axis=2).sum() == high**2 > 170**2
 
 
 def test_a_coarser_mesh_has_no_flat_triangles():

@@ -211,7 +211,8 @@ def robot_of(envs: VectorEnv) -> str:
 
 
 def blind(task: Experiment, robot: str = Nao.uid) -> GpuVectorEnv:
-    """Return one env of this process, without pictures."""
+    """Return one env of this process, without pictures, of the task's kinds."""
+    spoken = task.instructions
     return GpuVectorEnv(
         task.id,
         1,
@@ -220,6 +221,7 @@ def blind(task: Experiment, robot: str = Nao.uid) -> GpuVectorEnv:
         obs_mode="state_dict",
         control_mode="pd_joint_target_delta_pos",
         robot_uids=robot,
+        kinds=spoken.kinds if isinstance(spoken, Spoken) else None,
     )
 
 

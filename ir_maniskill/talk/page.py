@@ -8,7 +8,7 @@ import logging
 import socket
 from collections.abc import Callable
 from functools import partial
-from queue import Empty, SimpleQueue
+from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -110,11 +110,9 @@ class Page:
 
     def obey(self) -> bool:
         """Do what visitors wished for; return whether there was anything."""
-        wished = False
-        with contextlib.suppress(Empty):
-            while True:
-                self.attempt(self._wishes.get_nowait())
-                wished = True
+        wished = not self._wishes.empty()
+        while not self._wishes.empty():
+            self.attempt(self._wishes.get())
         return wished
 
     def attempt(self, call: Callable[[], None]) -> None:
@@ -238,13 +236,15 @@ class Page:
 def side_by_side(pictures: list[np.ndarray]) -> np.ndarray:
     """Return pictures in the middle of a row, as coarse as they are [H, W, 3] uint8."""
     row = Image.new("RGB", (ROW, PICTURE), (BACKGROUND,) * 3)
-    wide = [round(PICTURE * p.shape[1] / p.shape[0]) for p in pictures]
-    left = (ROW - sum(wide) - GAP * (len(wide) - 1)) // 2
+    ratios = [p.shape[1] / p.shape[0] for p in pictures]
+    room = ROW - GAP * (len(ratios) - 1)
+    high = min(PICTURE, int(room / sum(ratios))) if ratios else PICTURE
+    wide = [int(high * ratio) for ratio in ratios]
+    left, top = (room - sum(wide)) // 2, (PICTURE - high) // 2
     for picture, width in zip(pictures, wide, strict=True):
-        smooth = (
-            Image.Resampling.NEAREST if len(picture) < PICTURE else Image.Resampling.BOX
-        )
-        row.paste(Image.fromarray(picture).resize((width, PICTURE), smooth), (left, 0))
+        coarse = len(picture) < high
+        smooth = Image.Resampling.NEAREST if coarse else Image.Resampling.BOX
+        row.paste(Image.fromarray(picture).resize((width, high), smooth), (left, top))
         left += width + GAP
     return np.asarray(row)
 

@@ -14,7 +14,7 @@ from ir_maniskill.agent.language_system import LexiconTransformer, TokenTransfor
 from ir_maniskill.experiment import Experiment
 from ir_maniskill.language.lexicon import lexicon
 from ir_maniskill.language.tokens import split_words
-from ir_maniskill.policy import Policy, load_policy, shipped
+from ir_maniskill.policy import Policy, load_policy, ships
 from ir_maniskill.talk.reading import Reading
 from ir_maniskill.training.checkpoint import MismatchError
 
@@ -56,11 +56,9 @@ class RandomMotion:
 def fitting(task: str, robot: str, checkpoint: Path | None = None) -> list[str]:
     """Return what can play a task with a robot, the best first: names for `load`."""
     experiment = catalog.get(task)
-    files = [str(checkpoint)] if checkpoint else []
-    own = [task] if shipped(task).is_file() else []
-    others = [i for i in catalog.available() if shipped(i).is_file() and i != task]
-    found = [n for n in (*files, *own, *others) if _fits(load(n), experiment, robot)]
-    return [*found, RANDOM]
+    given = [str(checkpoint)] if checkpoint else []
+    names = dict.fromkeys([*given, *sorted(ships(), key=lambda i: i != task)])
+    return [*(n for n in names if _fits(load(n), experiment, robot)), RANDOM]
 
 
 def _fits(policy: Policy, experiment: Experiment, robot: str) -> bool:

@@ -247,8 +247,8 @@ class Session:
     def examples(self) -> list[str]:
         """Return sentences to try: the task's, or some that can be done here."""
         if known := self._known():
-            color = next(name for name in self.names if name).split()[0]
-            more = (f"please tap the {color} one", "Touch the leftmost one.")
+            name = next(filter(None, self.names))
+            more = (f"please tap the {name}", "Touch the leftmost one.")
             return [*[i.text for i in known[:5]], *more]
         (here,) = things(replace(self.scene, start=self.scene.pose))
         allows = self.env.layout.allows(here)

@@ -133,9 +133,7 @@ def describe(agent: Agent, config: TrainConfig, **facts: object) -> dict[str, An
         "version": packages.version("ir-maniskill"),
         "config": to_data(resolved),
         "spec": dataclasses.asdict(agent.spec),
-        "env_id": config.env_id,
         "task": task_facts(catalog.get(config.env_id)) if known else {},
-        "seed": config.seed,
         **facts,
     }
 

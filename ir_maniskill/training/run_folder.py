@@ -119,7 +119,7 @@ class RunFolder:
 
     def save_at_last(self, snapshot: Stored) -> None:
         """Write the checkpoint of a run that has to stop."""
-        with _undisturbed():
+        with _handled(STOPPING, signal.SIG_IGN):  # such as a second Ctrl-C
             checkpoint.write(self.last, snapshot)
         steps = snapshot.metadata["steps"]
         log.warning("stopped at step %d: resume goes on there", steps)
@@ -156,32 +156,23 @@ class RunFolder:
             self._lock = None
 
 
-@contextlib.contextmanager
-def interruptible() -> Iterator[None]:
+def interruptible() -> contextlib.AbstractContextManager[None]:
     """Let whatever asks a program to end interrupt it, as Ctrl-C does."""
-    main = threading.current_thread() is threading.main_thread()
-    deadly = [s for s in STOPPING if main and signal.getsignal(s) is signal.SIG_DFL]
-    for number in deadly:  # nohup has SIGHUP ignored, which it stays
-        signal.signal(number, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        for number in deadly:
-            signal.signal(number, signal.SIG_DFL)
+    # nohup has SIGHUP ignored, which it stays.
+    deadly = [s for s in STOPPING if signal.getsignal(s) is signal.SIG_DFL]
+    return _handled(deadly, signal.default_int_handler)
 
 
 @contextlib.contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Ignore a second Ctrl-C, or what a job scheduler sends to make sure."""
-    if threading.current_thread() is not threading.main_thread():
-        yield  # signals are not ours to handle
-        return
-    handlers = {s: signal.signal(s, signal.SIG_IGN) for s in STOPPING}
+def _handled(numbers: Iterable[signal.Signals], handler: Any) -> Iterator[None]:
+    """Have signals handled otherwise meanwhile; only the main thread can."""
+    main = threading.current_thread() is threading.main_thread()
+    before = {n: signal.signal(n, handler) for n in numbers if main}
     try:
         yield
     finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+        for number, old in before.items():
+            signal.signal(number, old)
 
 
 def stored_config(folder: Path) -> TrainConfig | None:

@@ -131,7 +131,6 @@ class Runner:
             Figures of what it learned, if it is time for them.
         """
         check_finite(self.state, "observation", "the simulation became unstable")
-        self.algorithm.share = min(self.steps / self.config.total_steps, 1.0)
         action = self.algorithm.act(self.state)
         figures, stepped = self._stepped(action.to(self.envs.device))
         obs, reward, terminated, truncated, info = stepped
@@ -148,7 +147,12 @@ class Runner:
         here = self._here(told)
         self.algorithm.observe(Outcome(**here, state=self.state, final=final))
         self.steps += self.config.num_envs
-        return self._learned() if figures is None else figures
+        figures = self._learned() if figures is None else figures
+        self._tell_share()
+        return figures
+
+    def _tell_share(self) -> None:
+        self.algorithm.share = min(self.steps / self.config.total_steps, 1.0)
 
     def _stepped(self, action: Tensor) -> tuple[Figures | None, Step]:
         """Step all envs; if the algorithm can, let it learn meanwhile.
@@ -310,6 +314,7 @@ class Runner:
                 f"{self.folder.last} does not fit this agent: {error}; train anew in "
                 "another folder"
             ) from error
+        self._tell_share()
         self.state = self._new_scenes()
         self.algorithm.restart()
 
