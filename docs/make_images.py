@@ -28,7 +28,7 @@ from ir_maniskill import experiment as catalog
 from ir_maniskill.checks import require_choice
 from ir_maniskill.evaluation.evaluate import EVALUATION_SEED
 from ir_maniskill.evaluation.plots import style_axes
-from ir_maniskill.evaluation.video import Snapshot, record, write_video
+from ir_maniskill.evaluation.video import Shot, record, write_video
 from ir_maniskill.language import SPLITS
 from ir_maniskill.policy import load_policy
 
@@ -188,7 +188,7 @@ def film(task: str, path: Path) -> None:
 
 def episode(
     task: str, told: int | str, seed: int = EVALUATION_SEED, act: Any = None
-) -> Iterator[Snapshot]:
+) -> Iterator[Shot]:
     """Play one episode with the shipped policy, or with `act` in its place."""
     policy = load_policy(task)
     return record(

@@ -14,17 +14,17 @@ from ir_maniskill.evaluation.video import (
     RIGHT,
     SIZE,
     WRONG,
-    Snapshot,
+    Shot,
     draw,
     write_video,
 )
 from ir_maniskill.goals import Instruction, Ref, Touch
 
 
-def snapshot(step=3, right=(), wrong=(), history=((False, False),) * 3):
+def shot(step=3, right=(), wrong=(), history=((False, False),) * 3):
     gray = np.full((540, 836, 3), 127, np.uint8)
     picture = np.full((64, 32, 3), 200, np.uint8)
-    return Snapshot(
+    return Shot(
         view=gray,
         cameras={"top_camera": picture, "front_camera": picture},
         instruction="Touch the blue cube.",
@@ -54,7 +54,7 @@ def light(finger):
 def test_the_policys_pictures_are_shown_whole_and_not_stretched(rows, columns):
     corner = np.full((rows, columns, 3), 200, np.uint8)
     corner[: rows // 2, : columns // 2] = RIGHT
-    frame = draw(dataclasses.replace(snapshot(), cameras={"top_camera": corner}))
+    frame = draw(dataclasses.replace(shot(), cameras={"top_camera": corner}))
     x, y, width, height = video.PICTURES[0]
     ys, xs = np.nonzero((frame[y : y + height, x : x + width] == RIGHT).all(axis=-1))
     assert np.ptp(xs) + 1 == width // 2
@@ -65,8 +65,8 @@ def test_the_policys_pictures_are_shown_whole_and_not_stretched(rows, columns):
 @pytest.mark.parametrize("finger", range(6))
 def test_a_touching_finger_lights_its_own_lamp_only(finger):
     for color, frame in (
-        (RIGHT, draw(snapshot(right=[finger]))),
-        (WRONG, draw(snapshot(wrong=[finger]))),
+        (RIGHT, draw(shot(right=[finger]))),
+        (WRONG, draw(shot(wrong=[finger]))),
     ):
         lit = [share(frame, light(other), color) == 1 for other in range(6)]
         assert lit == [other == finger for other in range(6)]
@@ -76,7 +76,7 @@ def lit(count, names):
     """Return the share of the lights' card that is green if `count` fingers touch."""
     right = tuple(index < count for index in range(len(names)))
     shown = {"hands": {"hand": names}, "right": right, "wrong": (False,) * len(names)}
-    frame = draw(Snapshot(**{**vars(snapshot()), **shown}))
+    frame = draw(Shot(**{**vars(shot()), **shown}))
     return share(frame, video.HANDS, RIGHT)
 
 
@@ -89,14 +89,14 @@ def test_another_robot_has_as_many_lights_as_fingers():
 
 def test_the_timeline_shows_what_each_step_touched():
     history = ((True, False), (False, True), (True, True))
-    frame = draw(snapshot(history=history))
+    frame = draw(shot(history=history))
     # One cell is all green, one all red, one half and half; the fourth is to come.
     assert share(frame, video.TIMELINE, RIGHT) == pytest.approx(1.5 / 4, abs=0.02)
     assert share(frame, video.TIMELINE, WRONG) == pytest.approx(1.5 / 4, abs=0.02)
 
 
 def test_the_view_and_the_pictures_are_shown():
-    frame = draw(snapshot())
+    frame = draw(shot())
     assert (frame.shape, frame.dtype) == ((SIZE[1], SIZE[0], 3), np.uint8)
     assert share(frame, video.VIEW, (127, 127, 127)) > 0.99
     for box in video.PICTURES:
@@ -105,7 +105,7 @@ def test_the_view_and_the_pictures_are_shown():
 
 def test_a_policy_without_pictures_has_its_numbers_in_their_place():
     numbers = {"touch": np.array([1.0, 0, 0, -0.5, 0, 7])}
-    frame = draw(dataclasses.replace(snapshot(), cameras={}, numbers=numbers))
+    frame = draw(dataclasses.replace(shot(), cameras={}, numbers=numbers))
     x, y, width, height = video.NUMBERS
     card = (frame[y + 26 : y + height, x : x + width] == video.INK).all(axis=-1)
     heights = card.sum(axis=0)[18 + 25 : 18 + 312 : 52]  # in the middle of each bar
@@ -120,7 +120,7 @@ FILMS = [("a.mp4", (1280, 720)), ("B.MP4", (1280, 720)), ("a.gif", (640, 360))]
 @pytest.mark.parametrize("name, size", FILMS)
 def test_videos_play_and_hold_their_last_frame(name, size, tmp_path):
     path = tmp_path / "new" / name
-    shots = [snapshot(step=step, right=[step]) for step in range(5)]
+    shots = [shot(step=step, right=[step]) for step in range(5)]
     write_video(path, iter(shots), speed=0.5, hold=0.5)
     reader = imageio.get_reader(path)
     frames = [np.asarray(frame) for frame in reader]
@@ -137,7 +137,7 @@ def test_videos_play_and_hold_their_last_frame(name, size, tmp_path):
 @pytest.mark.parametrize("speed, frames", [(0.7, 12), (2.0, 12), (4.0, 6)])
 def test_a_gif_is_as_fast_as_browsers_can_show(speed, frames, tmp_path):
     path = tmp_path / "a.gif"
-    shots = [snapshot(step=0, right=[step % 6]) for step in range(12)]
+    shots = [shot(step=0, right=[step % 6]) for step in range(12)]
     write_video(path, shots, speed=speed)
     film = Image.open(path)
     times = []  # [ms]
@@ -155,7 +155,7 @@ def test_a_gif_keeps_the_colors_of_small_things(tmp_path):
     for step, color in enumerate((blue, blue, blue, red)):
         view = np.tile(shade, (540, 1, 1))
         view[240:280, x : x + 40] = color
-        shots.append(Snapshot(**{**vars(snapshot(step=step)), "view": view}))
+        shots.append(Shot(**{**vars(shot(step=step)), "view": view}))
     write_video(tmp_path / "a.gif", shots)
     frames = list(imageio.get_reader(tmp_path / "a.gif"))
     at = (video.VIEW[1] + 260) // 2, (video.VIEW[0] + x + 20) // 2
@@ -166,15 +166,15 @@ def test_a_gif_keeps_the_colors_of_small_things(tmp_path):
 def test_letters_of_other_alphabets_are_no_boxes():
     heads = []
     for text in ("\u00dc", "\u0416", "\u03a9", "\uffff"):  # the last has no glyph
-        shown = Snapshot(**{**vars(snapshot()), "instruction": text})
+        shown = Shot(**{**vars(shot()), "instruction": text})
         heads.append(draw(shown)[46:90, 30:80].tobytes())
     assert len(set(heads)) == 4
 
 
 def test_a_long_sentence_stays_beside_the_legend():
-    long = Snapshot(**{**vars(snapshot()), "instruction": "Touch the cube. " * 8})
+    long = Shot(**{**vars(shot()), "instruction": "Touch the cube. " * 8})
     x, y = video.LEGEND
-    here, usual = draw(long), draw(snapshot())
+    here, usual = draw(long), draw(shot())
     assert np.array_equal(
         here[y - 30 : y + 30, x - 4 :], usual[y - 30 : y + 30, x - 4 :]
     )
@@ -182,8 +182,8 @@ def test_a_long_sentence_stays_beside_the_legend():
 
 def test_an_episode_of_more_steps_than_pixels_can_be_drawn():
     steps = 10_000
-    shot = snapshot(step=steps, history=((True, False),) * steps)
-    frame = draw(Snapshot(**{**vars(shot), "total_steps": steps}))
+    whole = shot(step=steps, history=((True, False),) * steps)
+    frame = draw(Shot(**{**vars(whole), "total_steps": steps}))
     assert share(frame, video.TIMELINE, RIGHT) > 0.95
 
 
@@ -193,7 +193,7 @@ def test_a_film_that_fails_leaves_the_older_one(name, tmp_path):
     path.write_bytes(b"older")
 
     def broken():
-        yield snapshot()
+        yield shot()
         raise RuntimeError("the simulation failed")
 
     with pytest.raises(RuntimeError, match="simulation failed"):
@@ -208,7 +208,7 @@ def test_a_film_that_ffmpeg_cut_short_is_an_error(tmp_path, monkeypatch):
     fewer = lambda name: (count(name)[0] - 1, 0.0)  # noqa: E731
     monkeypatch.setattr(video.imageio_ffmpeg, "count_frames_and_secs", fewer)
     with pytest.raises(OSError, match="cannot write .*a.mp4: ffmpeg did not write all"):
-        write_video(path, [snapshot()])
+        write_video(path, [shot()])
     assert not path.exists()
 
 

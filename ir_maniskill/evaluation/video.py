@@ -75,7 +75,7 @@ SHARPNESS = 1.5
 
 
 @dataclass(frozen=True)
-class Snapshot:
+class Shot:
     """What one frame shows."""
 
     view: np.ndarray
@@ -111,7 +111,7 @@ def record(
     frames: int = 3,
     env_kwargs: dict[str, Any] | None = None,
     instructions: Sequence[Any] | None = None,
-) -> Iterator[Snapshot]:
+) -> Iterator[Shot]:
     """Play episodes and yield every step; the arguments are `evaluate_policy`'s.
 
     In place of envs it takes an id and keyword arguments for `gym.make`: what is filmed
@@ -171,7 +171,7 @@ def show(stage: Any, scene: Scene) -> np.ndarray:
 @torch.no_grad()  # no inference mode: what the env keeps must stay changeable
 def _play(
     policy: Policy, env: gym.Env, obs: Any, stack: StateStack, stage: gym.Env
-) -> Iterator[Snapshot]:
+) -> Iterator[Shot]:
     """Play the episode that a reset has begun."""
     base: Any = env.unwrapped
     state, total = stack.reset(obs), base.experiment.episode_steps
@@ -179,7 +179,7 @@ def _play(
     score = 0.0
     history: tuple[tuple[bool, bool], ...] = ()
     for step in range(total + 1):
-        yield Snapshot(
+        yield Shot(
             view=show(stage, scene_of(base)),
             cameras={
                 name: _picture(obs["sensor_data"][name]["rgb"]) for name in cameras(obs)
@@ -212,20 +212,20 @@ def _picture(tensor: Any) -> np.ndarray:
 # -- Drawing -------------------------------------------------------------------------
 
 
-def draw(snapshot: Snapshot) -> np.ndarray:
+def draw(shot: Shot) -> np.ndarray:
     """Draw a frame [720, 1280, 3] uint8."""
     page = _page().copy()
-    _paste(page, snapshot.view, VIEW, radius=14)
+    _paste(page, shot.view, VIEW, radius=14)
     canvas = ImageDraw.Draw(page)
-    for (name, picture), box in zip(snapshot.cameras.items(), PICTURES, strict=False):
+    for (name, picture), box in zip(shot.cameras.items(), PICTURES, strict=False):
         _draw_camera(page, name, picture, box)
-    if snapshot.numbers and not snapshot.cameras:
-        _draw_numbers(page, snapshot.numbers)
-    font = _fitting(snapshot.instruction, LEGEND[0] - 60, 34)
-    canvas.text((32, 66), snapshot.instruction, INK, font, anchor="lm")
-    _draw_timeline(canvas, snapshot)
-    _draw_hands(page, snapshot)
-    _draw_counters(canvas, snapshot)
+    if shot.numbers and not shot.cameras:
+        _draw_numbers(page, shot.numbers)
+    font = _fitting(shot.instruction, LEGEND[0] - 60, 34)
+    canvas.text((32, 66), shot.instruction, INK, font, anchor="lm")
+    _draw_timeline(canvas, shot)
+    _draw_hands(page, shot)
+    _draw_counters(canvas, shot)
     return np.asarray(page)
 
 
@@ -313,10 +313,10 @@ def _paste_shape(page: Image.Image, box: Box, color: Color, radius: int) -> None
     page.paste(color, (x, y, x + width, y + height), _mask(width, height, radius))
 
 
-def _draw_timeline(canvas: ImageDraw.ImageDraw, snapshot: Snapshot) -> None:
+def _draw_timeline(canvas: ImageDraw.ImageDraw, shot: Shot) -> None:
     """Draw one cell a step: green above if the goal holds, red below if a foul."""
     x, y, width, height = TIMELINE
-    total = snapshot.total_steps
+    total = shot.total_steps
     gap = 3 if total <= 100 else 0
     cell = (width + gap) / total
     for step in range(total):
@@ -324,8 +324,8 @@ def _draw_timeline(canvas: ImageDraw.ImageDraw, snapshot: Snapshot) -> None:
         if end < left:  # more steps than pixels: the next one takes its place
             continue
         upper = lower = CARD
-        if step < len(snapshot.history):
-            right, wrong = snapshot.history[step]
+        if step < len(shot.history):
+            right, wrong = shot.history[step]
             upper = RIGHT if right else WRONG if wrong else EDGE
             lower = WRONG if wrong else upper
         middle = y + height // 2
@@ -333,12 +333,12 @@ def _draw_timeline(canvas: ImageDraw.ImageDraw, snapshot: Snapshot) -> None:
         canvas.rectangle((left, middle, end, y + height - 1), lower)
 
 
-def _draw_hands(page: Image.Image, snapshot: Snapshot) -> None:
+def _draw_hands(page: Image.Image, shot: Shot) -> None:
     """Draw a row of lights for each hand, in the order of the robot's fingers."""
     x, y, _, _ = HANDS
     canvas = ImageDraw.Draw(page)
-    hands = snapshot.hands
-    touches = zip(snapshot.right, snapshot.wrong, strict=True)
+    hands = shot.hands
+    touches = zip(shot.right, shot.wrong, strict=True)
     for row, (hand, fingers) in enumerate(hands.items()):
         top = y + 14 + row * min(56, 112 // len(hands))
         canvas.text((x + 18, top + 14), hand.upper(), FAINT, _font(13))
@@ -371,13 +371,13 @@ def _draw_light(
     ImageDraw.Draw(page).text(text, name, ink, _font(12), anchor="mt")
 
 
-def _draw_counters(canvas: ImageDraw.ImageDraw, snapshot: Snapshot) -> None:
+def _draw_counters(canvas: ImageDraw.ImageDraw, shot: Shot) -> None:
     x, y, width, _ = COUNTERS
-    seconds = snapshot.step / CONTROL_FREQ
+    seconds = shot.step / CONTROL_FREQ
     columns = (
-        ("STEP", f"{snapshot.step} / {snapshot.total_steps}"),
+        ("STEP", f"{shot.step} / {shot.total_steps}"),
         ("TIME", f"{seconds:.2f} s"),
-        ("RETURN", f"{snapshot.score:.1f}"),
+        ("RETURN", f"{shot.score:.1f}"),
     )
     for index, (title, value) in enumerate(columns):
         left = x + 18 + index * width // 3
@@ -390,7 +390,7 @@ def _draw_counters(canvas: ImageDraw.ImageDraw, snapshot: Snapshot) -> None:
 
 def write_video(
     path: Path,
-    snapshots: Iterable[Snapshot],
+    shots: Iterable[Shot],
     *,
     speed: float = 0.5,
     hold: float = 1.0,
@@ -400,10 +400,10 @@ def write_video(
 
     Args:
         path: The file; its name ends in .mp4 or .gif.
-        snapshots: At least one.
+        shots: At least one.
         speed: 1 is real time.
         hold: How long the last frame of an episode stays [s].
-        total: How many snapshots to expect, for the progress bar.
+        total: How many shots to expect, for the progress bar.
 
     Raises:
         ValueError: Of another name.
@@ -413,8 +413,8 @@ def write_video(
     rate = CONTROL_FREQ * speed
 
     def frames() -> Iterator[np.ndarray]:
-        for snapshot in tqdm(snapshots, "film", total, leave=False, unit=" frames"):
-            frame, last = draw(snapshot), snapshot.step == snapshot.total_steps
+        for shot in tqdm(shots, "film", total, leave=False, unit=" frames"):
+            frame, last = draw(shot), shot.step == shot.total_steps
             yield from [frame] * (1 + round(hold * rate) * last)
 
     write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4

@@ -31,7 +31,7 @@ class Moment:
     """Who played."""
     scene: video.Scene
     """Where everything was."""
-    shot: video.Snapshot
+    shot: video.Shot
     """The frame, but for the human view, and of its history this step alone."""
 
 
@@ -46,7 +46,7 @@ class Film:
         """Keep the step that was just made."""
         touching = [s for hand in session.lights().values() for s in hand.values()]
         wrong = tuple(state == "wrong" for state in touching)
-        shot = video.Snapshot(
+        shot = video.Shot(
             view=np.empty(0),
             cameras={name: seen.copy() for name, seen in session.pictures().items()},
             instruction=session.reading.heard,
@@ -68,7 +68,7 @@ class Film:
             video.write_video(path, self._frames(), speed=1.0, hold=0.0)
         return bool(self._moments)
 
-    def _frames(self) -> Iterator[video.Snapshot]:
+    def _frames(self) -> Iterator[video.Shot]:
         with ExitStack() as opened:
             stages: dict[str, Any] = {}
             for take in self._takes():
@@ -89,7 +89,7 @@ class Film:
         yield take
 
 
-def _shots(take: list[Moment], stage: Any) -> Iterator[video.Snapshot]:
+def _shots(take: list[Moment], stage: Any) -> Iterator[video.Shot]:
     history: tuple[tuple[bool, bool], ...] = ()
     for moment in take:
         history += moment.shot.history
