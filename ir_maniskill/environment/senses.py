@@ -32,7 +32,7 @@ joined in "privileged" [N, P]."""
 Encoder = Literal["language", "vision", "body", "privileged", "none"]
 Part = Literal["agent", "extra"]
 Info = dict[str, Tensor]
-Measure = Callable[[Any, Info], Tensor]
+Observer = Callable[[Any, Info], Tensor]
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Term:
     "none": a loss only."""
     shape: str
     """What it is for each env, e.g. "J" or "K, H, W, 3"."""
-    measure: Measure | None = None
+    measure: Observer | None = None
     """Returns it [N, shape] from the env and its info; None: it comes with the robot's
     proprioception, or `read` finds it."""
     sense: str = ""
@@ -102,12 +102,12 @@ def _touched(_: Any, info: Info) -> Tensor:
     return info["contact"].any(dim=2).float()
 
 
-def _of_sentence(table: str) -> Measure:
+def _of_sentence(table: str) -> Observer:
     """Return what finds the active sentence's row of a table [I, ...]."""
     return lambda env, _: getattr(env.instructional_set, table)[env.instruction_index]
 
 
-def _privileged(name: str, shape: str, measure: Measure, part: Part = "extra") -> Term:
+def _privileged(name: str, shape: str, measure: Observer, part: Part = "extra") -> Term:
     return Term(name, "privileged", shape, measure, sense="state", part=part)
 
 
