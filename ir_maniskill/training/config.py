@@ -267,7 +267,6 @@ CONFIGS: dict[str, TrainConfig] = {
         algorithm="sac",
         total_steps=880_000,
         eval_interval=100_000,
-        kinds=("touch", "hand", *("where", "both", "then") * 2, *("push",) * 4),
         frames=1,
         penalty_warmup=0.0,
         reward_weights=RewardWeights(
