@@ -90,12 +90,6 @@ class Judgement(NamedTuple):
     named_position: Tensor | None  # [N, 3] [m], where the named object is thought to be
 
 
-def bfloat16_autocast(wanted: bool = True) -> torch.autocast:
-    """Return a context that multiplies in 16 bits on a CPU that is faster then."""
-    known = getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)
-    return torch.autocast("cpu", torch.bfloat16, enabled=wanted and known())
-
-
 class StateEncoder(nn.Module):
     """s_t -> B_t: Language System, Perceptual System and Alignment."""
 
@@ -150,9 +144,7 @@ class StateEncoder(nn.Module):
             said = self.reading(said)
         embeddings = [said]
         if self.vision is not None:
-            with bfloat16_autocast(self.training):
-                seen = self.vision(state["images"], said)
-            embeddings.append(seen.float())
+            embeddings.append(self.vision(state["images"], said))
         if self.body is not None:
             felt = {name: state[name] for name in self.felt}
             if self.standardize is not None:

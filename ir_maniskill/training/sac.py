@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ir_maniskill.agent.actor import Squashed, SquashedActor
-from ir_maniskill.agent.agent import Agent, StateSpec, bfloat16_autocast
+from ir_maniskill.agent.agent import Agent, StateSpec
 from ir_maniskill.agent.object_vision import LENGTH, ObjectVision
 from ir_maniskill.checks import require
 from ir_maniskill.environment.robots.robot import robot_class
@@ -64,6 +64,12 @@ WIDTHS = (384, 384)
 """Units of each critic's layers."""
 PARTS = ("agent", "critics", "target_critics", "teacher", "replay")
 """What of the algorithm is in a checkpoint, beside optimizers and numbers."""
+
+
+def bfloat16_autocast() -> torch.autocast:
+    """Return a context that multiplies in 16 bits where that is faster."""
+    known = getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)
+    return torch.autocast("cpu", torch.bfloat16, enabled=known())
 
 
 class Critics(nn.Module):
